@@ -40,7 +40,7 @@ def _pauses_of_any_length(patch: Patch) -> None:
 
 
 def _damaged_frames_count(patch: Patch) -> None:
-    patch(evidence, "SETTLED_S", 0.001)
+    patch(evidence, "MIN_SILENCE_S", 0.001)  # not 0: reports of one piece have one time, so no interval
     patch(StopEvidence, "on_noise", lambda self, at, damaged=True: None)
 
 
@@ -49,24 +49,24 @@ def _frames_continue_after_a_silence(patch: Patch) -> None:
 
 
 def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:
-    patch(StopEvidence, "_left_s", 20.0)
+    patch(StopEvidence, "_leaving_s", 20.0)
 
 
 def _any_frame_before_it(patch: Patch) -> None:
-    original = StopEvidence._left
+    original = StopEvidence._judge_leaving
 
-    def left(self: StopEvidence, at: float, quiet_s: float, within_s: float) -> evidence.Finding:
-        self._plain = self._plain or self._shape_at is not None or self._silent_mode is not None
-        return original(self, at, quiet_s, 20.0)
+    def judge_leaving(self: StopEvidence, at: float, silence_s: float, within_s: float) -> evidence.Finding:
+        self._closed_alone = self._closed_alone or self._other_mode_at is not None or self._silent_mode is not None
+        return original(self, at, silence_s, 20.0)
 
-    patch(StopEvidence, "_left", left)
+    patch(StopEvidence, "_judge_leaving", judge_leaving)
 
 
 def _silent_mode_after_any_rest(patch: Patch) -> None:
-    original = StopEvidence.opened
+    original = StopEvidence.on_mode_opened
     patch(
         StopEvidence,
-        "opened",
+        "on_mode_opened",
         lambda self, mode, now, *, silent, shown: original(self, mode, now, silent=silent, shown=True),
     )
 
@@ -113,7 +113,7 @@ RULES: dict[str, Callable[[Patch], None]] = {
     "nor are two, if one does not match the normal interval": _pauses_of_any_length,
     "damaged frames are no reports": _damaged_frames_count,
     "a frame with a silence in it is none": _frames_continue_after_a_silence,
-    "a report after LEFT_S does not show that a mode was left": _any_report_shows_that_a_mode_was_left,
+    "a report long after MODE00 does not show that a mode was left": _any_report_shows_that_a_mode_was_left,
     "nor one after more frames than MODE00": _any_frame_before_it,
     "a silent mode shows that it was left only if it was opened from a shown rest": _silent_mode_after_any_rest,
     "and after its silence": _silent_mode_without_its_silence,

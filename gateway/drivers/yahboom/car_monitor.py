@@ -70,9 +70,9 @@ class CarMonitor:
     def on_event(self, event: Event, now: float) -> None:
         """Update the model with an event of the decoder."""
         model = self.model
-        settled = not isinstance(event, Sensors) or model.evidence.is_settled(event)
+        is_credible = not isinstance(event, Sensors) or model.evidence.is_credible(event)
         was_open = model.platform.open_mode
-        contradictions = model.platform.on_event(event, counts=settled)
+        contradictions = model.platform.on_event(event, counts=is_credible)
         if model.platform.open_mode and not was_open and model.profile.stop_style is StopStyle.GENERAL:
             self._stops.leave_open_mode(now)
         for words in contradictions:
@@ -84,7 +84,7 @@ class CarMonitor:
         if not isinstance(event, Sensors):
             return
         before, silent_s = model.mode.verdict, model.mode.unheard_s(event.at)
-        model.mode.on_reading(event, counts=settled)
+        model.mode.on_reading(event, counts=is_credible)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
         # Stop the car after a silence, because a command may have been sent during it.
@@ -103,8 +103,8 @@ class CarMonitor:
             self._on_report(event, now)
         self._log_delivery(finding, now)
         self._stops.on_finding(finding, event.at, now)
-        if model.evidence.found_out:
-            self._on_found_out(now)
+        if model.evidence.changed_expectation:
+            self._on_changed_expectation(now)
 
     def _on_report(self, event: Sensors, now: float) -> None:
         """Update the model with a report of mode 0."""
@@ -137,8 +137,8 @@ class CarMonitor:
             self._not_obeyed_logged = False
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 
-    def _on_found_out(self, now: float) -> None:
-        """Handle a finding of the readings about the car itself."""
+    def _on_changed_expectation(self, now: float) -> None:
+        """Log that this car cannot show its stops, or that its rhythm is that of another program. Handle the latter."""
         name, learned = self.model.name, self.model.learned
         if learned.shows is Shows.NO:
             words = cases.NO_REACTION.why(name)

@@ -295,7 +295,7 @@ class Executor(Driver):
                 # One turn of the mode may ignore frames for longer than it takes to close the mode.
                 deaf_until = max(now, model.pacing.block_until) + model.for_stop(now).turn_s
                 model.left_at, model.left_until = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
-            model.evidence.closed(now, awake=model.is_awake(now))
+            model.evidence.on_mode_00(now, awake=model.is_awake(now))
         model.pacing.on_written(frame, now)
         self._update_model(frame, now)
         match source:
@@ -337,7 +337,7 @@ class Executor(Driver):
                 if model.auto:
                     model.learned.opened_as = model.profile.name
                 model.mode.on_mode_sent(mode, now=now, block_s=block_s)
-                model.evidence.opened(mode, now, silent=mode in model.profile.silent_modes, shown=shown)
+                model.evidence.on_mode_opened(mode, now, silent=mode in model.profile.silent_modes, shown=shown)
                 self._end_rest(TrustEvent.MODE_SENT, now)
             case ModeClose():
                 if self.mode_sent is not None and self.mode_sent[0].command.what != SetMode(Mode.MANUAL):
@@ -345,12 +345,12 @@ class Executor(Driver):
                 model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
             case _:
                 model.mode.on_written(block_s, now=now)
-                model.evidence.blocked(blocking_kind(frame), block_s, now)
+                model.evidence.on_block(blocking_kind(frame), block_s, now)
                 if isinstance(frame, General) and frame.motion is not Motion.STOP:
-                    model.evidence.sent_motion()
+                    model.evidence.on_motion()
                     self._end_rest(TrustEvent.MOTION_SENT, now)
                 else:
-                    model.evidence.sent_other()
+                    model.evidence.on_other_frame()
                 if shown and frame != model.believed.with_fan(STOP_FRAME) and model.trust.shown:
                     self._doubt_rest(now)
         if model.stop_style is StopStyle.GENERAL and (model.mode.asked is None or model.mode.is_left):

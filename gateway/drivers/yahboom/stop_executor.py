@@ -240,7 +240,7 @@ class StopExecutor:
         running.begin_try(
             stop_in_progress.soft(context) if running.at_rest else stop_in_progress.recovery(context), now
         )
-        self.model.evidence.tried_again()
+        self.model.evidence.on_retry()
 
     def fail_late(self, running: StopInProgress, now: float) -> None:
         """Fail the commands that have waited too long for evidence. Continue the stop."""

@@ -1,7 +1,8 @@
 """Detects from the car's readings whether a stop arrived. `cases` lists the possible evidence of each stop. Pure.
 
 The car acknowledges nothing. A gateway only knows the frames that it wrote, and the times at which readings arrived.
-This essay is about what those times can prove, what they cannot, and what is still doubtful.
+This essay is about what those times can prove, what they cannot, and what is still doubtful. Two frames stop a car. The
+general stop ends a motion of mode 0, and other modes ignore it. `MODE00` brakes and closes any mode.
 
 *Why pauses.* On most cars `MODE00` makes the program beep, which blocks it for about a second. Meanwhile the car sends
 nothing, so the next report comes later by just that second. This delay is the acknowledgement that the protocol lacks.
@@ -18,25 +19,27 @@ its stops are never shown. That has no other disadvantage: they end as `sent`, a
 *Why not one pause.* A link that loses both `MODE00` and the report after it leaves a gap, too: two intervals instead of
 one. If the interval is about as long as the block, that gap looks like a pause. On a car that reports every second,
 half of all outages of 0.6 s around a stop look like that. So two pauses are needed, each around its own `MODE00`. Three
-are needed if one of them is in doubt: if it is too long (because of a slow link, or a report that the link held), or if
-it differs from the block by more than the intervals have differed so far, and there were only few intervals.
+are needed if one of them is in doubt. A pause is in doubt if it is too long: the link may be slow, or may have held a
+report. While few intervals have been seen, it is also in doubt if it differs from the block by more than those
+intervals differ from each other.
 
 *Why a control.* A half-duplex link receives nothing for a moment at each write. If the car does not receive our frames
 either, each `MODE00` seems to make a pause, for ever. Often the length of the gap shows whether a report was lost or
 the car was blocked. It does not if the block is about a whole number of intervals. Then the gateway writes a general
-stop a third of an interval after a report. This frame does not block, so the next report must come on time. A link that
-was mute from a `MODE00` until the report after it is mute for as long again, so it hides this report for certain,
-however much the intervals differ. If the report is missing or damaged, the link made the pauses.
+stop a third of an interval after a report. This frame does not block, so the next report must come on time. Suppose
+that the link made the pauses, because it is mute after each write until the report after `MODE00` is lost. Then it is
+mute for as long after the general stop, so it loses this report, too, however much the intervals differ. So if the
+report is missing or damaged, the link made the pauses.
 
 *Why silence must follow.* A link that holds reports makes gaps of any length. But the held report comes late, and the
 next one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in
 which such a report would have come.
 
 *Modes.* If a car reports in a mode, the form of its next report shows that it left the mode. On a car that was seen to
-block, one report is enough. But the car must have begun the report after it obeyed `MODE00`, and the report must come
-earlier than it could after a `MODE00` that lost its digits: that frame opens mode 0 with the motors on, and blocks for
-longer. The silence of a silent mode shows nothing. But if the mode was opened while the car had shown its rest, the end
-of the silence shows that it was left.
+block, one report is enough, if it comes at the right time. It must not come too early: the car must have begun it after
+it obeyed `MODE00`. And it must not come too late: if `MODE00` lost its digits on the way, the car opens mode 0 with the
+motors on, and that blocks it for longer. The silence of a silent mode shows nothing. But if the car was shown to stand
+before the mode was opened, the end of the silence shows that it left the mode.
 
 *Damaged reports.* Reports have no checksum. A damaged frame of another mode can look like one of mode 0, so a report
 counts only after a silence that no such mode has. The start of one frame and the end of another can be joined. So the
@@ -58,10 +61,10 @@ from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.protocol.timing import FRAME_S
 from schemas.words import Blocking, Mode, Shows
 
-SETTLED_SHARE: Final = 0.6
-SETTLED_S: Final = 0.8
-"""Minimum silence before a mode-0 report that counts: this share of the interval, at most this time. In another mode
-the car sends 20 frames a second, so a damaged one that looks like mode 0 has no such silence before it."""
+MIN_SILENCE_SHARE: Final = 0.6
+MIN_SILENCE_S: Final = 0.8
+"""Minimum silence before a report of mode 0, so that it counts: this share of the interval, at most this time. In other
+modes the car sends 20 frames a second, so a damaged frame that looks like mode 0 has no such silence before it."""
 FASTEST_S: Final = 0.3
 """Interval of the fastest car. It is used until the interval of this car is known."""
 BUNCHED_SHARE: Final = 0.3
@@ -70,11 +73,11 @@ BUNCHED_S: Final = 0.4
 EARLY_S: Final = 0.05
 """How much earlier than the end of a block a report may seem to arrive."""
 WIRE_S: Final = 0.02
-"""Time from the end of a block to the report after it. It is less than a report of 41 bytes takes on the wire."""
+"""Minimum time from the end of a block to the arrival of the report after it: a report takes longer on the wire."""
 LATE_S: Final = 0.2
 """Additional time on a slow link for the report that shows the end of a mode. Such a late report is only a pause."""
-SHAPE_UNTIL_S: Final = 1.0
-"""Maximum time for which readings of a mode continue after the `MODE00` that ends it."""
+OTHER_MODE_LINGERS_S: Final = 1.0
+"""Maximum time for which readings of a mode still arrive after the `MODE00` that ends it."""
 LONGER_S: Final = 0.65
 """Maximum time by which a pause may be longer than the block. Such a pause is in doubt."""
 PAUSES: Final = 2
@@ -82,18 +85,18 @@ PAUSES: Final = 2
 PAUSES_IN_DOUBT: Final = 3
 """Number of pauses that are needed if one of them is in doubt."""
 MISFITS: Final = 2
-"""Number of intervals that are neither normal nor a pause after which the rhythm is measured without a `MODE00`."""
+"""After this many intervals that are neither normal nor a pause, the rhythm is measured again without a `MODE00`."""
 SETTLING_S: Final = 0.25
 """Minimum time without a reading after the last pause, before the pauses count."""
-SHAPES: Final = 2
-"""Number of consecutive readings in the form of another mode that show that mode."""
+OTHER_MODE_READINGS: Final = 2
+"""After this many consecutive readings in the form of another mode, the car is in that mode."""
 ROUND_TRIP_S: Final = 2.5
 """Round trip of a slow link, which is allowed for from the second try on: the car may have sent an earlier report
 before it received `MODE00`."""
 READ_LATE_S: Final = 0.3
-"""Maximum time from a frame to a report that was under way before the car read the frame."""
+"""If a report comes sooner than this after a frame, the car may have sent it before it read the frame."""
 IN_FLIGHT_S: Final = 0.1
-"""Minimum time from a frame to a report that the car sent after it could have read the frame."""
+"""If a report comes sooner than this after a frame, the car must have sent it before it read the frame."""
 
 
 class Finding(StrEnum):
@@ -101,13 +104,13 @@ class Finding(StrEnum):
 
     NOTHING = "nothing"
     REPORT = "report"
-    """A report of mode 0 with an echo that is no result of a `MODE00`. The car could react to a `MODE00` now."""
+    """A report of mode 0 whose sonar heard an echo. No `MODE00` is waiting for it, so one could be judged now."""
     UNJUDGED = "unjudged"
-    """The same, but the rhythm of the car is not known, so a `MODE00` now would show nothing."""
+    """The same, but the rhythm of the car is not known, so a `MODE00` could not be judged now."""
     PAUSE = "pause"
     """A pause. More are needed."""
     CONTROL = "control"
-    """A pause that the link may have made by itself. The next frame must be one that does not block."""
+    """A pause that the link may have made by itself. The next frame must be the control: one that does not block."""
     SETTLING = "settling"
     """The last needed pause. The stop is shown if no reading follows too early."""
     LOST = "lost"
@@ -123,7 +126,10 @@ _NEVER: Final = float("-inf")
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """A frame that blocks the car: its kind, its maximum block, and when it was written."""
+    """A frame that blocks the car: its kind, its maximum block, and when it was written.
+
+    `kind` is None for a `MODE00` that will not be judged. Its block is not learned.
+    """
 
     kind: Blocking | None
     block_s: float
@@ -144,19 +150,20 @@ class StopEvidence:
     """When the pauses count, unless a reading arrives earlier. None if there are not enough pauses."""
     without_echo: int = 0
     """Number of consecutive reports without an echo."""
-    found_out: bool = False
-    """True if the last reading has shown that this car cannot show a stop, or that it has another rhythm."""
+    changed_expectation: bool = False
+    """True if, by the last reading, this car cannot show a stop after all, or has another rhythm than before."""
     _last_at: float = _NEVER
     """When the last bytes arrived, except text and frames of the options (arm, gyro)."""
     _foreign_at: float = _NEVER
     """When the last frame arrived that is not a report of mode 0, whether whole or corrupted."""
-    _before: float | None = None
-    """When the last report with an echo arrived, if nothing else has arrived since."""
-    _before_no_echo: float | None = None
-    _pending: float | None = None
-    """When the last `MODE00` was written, if it has no result yet."""
-    _delay_s: float | None = None
-    """The delay of the first report after that `MODE00`, if it is known."""
+    _echo_report_at: float | None = None
+    """When the last report with an echo arrived. None if anything else has arrived since."""
+    _no_echo_report_at: float | None = None
+    """The same for the last report without an echo."""
+    _mode_00_at: float | None = None
+    """When the last `MODE00` was written. None if it has a result, or will not be judged."""
+    _first_delay_s: float | None = None
+    """The delay of the first report after that `MODE00`. None if it is not known."""
     _delayed: int = 0
     """Number of this stop's `MODE00` frames after which the first report was late, but not by the block."""
     _pauses: int = 0
@@ -164,18 +171,20 @@ class StopEvidence:
     _unjudged: bool = False
     """True if a frame was written after the `MODE00` that the next pause would judge."""
     _controlled: bool = False
-    """True if a general frame of this stop did not delay a report."""
-    _blocking: list[_Block] = field(default_factory=list)
-    """The other frames that block, since the last report."""
+    """True if the control of this stop was passed: the report after a frame that does not block came on time."""
+    _blocks: list[_Block] = field(default_factory=list)
+    """The other frames that block, written since the last report."""
     _misfits: int = 0
     """Number of intervals with a `MODE00` that were neither normal nor a pause. Another program may be running."""
-    _fast_before: bool = False
-    """True if the last bytes were a report with an echo, however early it arrived."""
-    _general: bool = False
-    """True if a general frame that does not block was written since the last report."""
-    _window_s: float = 0.0
-    _shapes: int = 0
-    _shape_at: float | None = None
+    _ended_with_echo: bool = False
+    """True if the last bytes were a report with an echo, also if it arrived too early to count."""
+    _other_frame_written: bool = False
+    """True if a frame other than `MODE00` was written since the last report."""
+    _older_reports_s: float = 0.0
+    """Time after `MODE00` for which reports may arrive that the car sent before it. 0 until a stop is tried again."""
+    _other_mode_readings: int = 0
+    """Number of consecutive readings in the form of another mode."""
+    _other_mode_at: float | None = None
     """When the last reading of another mode arrived, since the last motion or the opening of a mode."""
     _silent_mode: Mode | None = None
     """The silent mode that was opened while the car had shown its rest."""
@@ -183,8 +192,8 @@ class StopEvidence:
     """When the last mode was opened."""
     _closed_at: float | None = None
     """When the first `MODE00` since then was written, or None if none was."""
-    _plain: bool = False
-    """True if no other frame was written before that `MODE00`."""
+    _closed_alone: bool = False
+    """True if no frame was written between the opening of the mode and that `MODE00`, nor a second `MODE00` since."""
 
     # ------------------------------------------------------------------ the car's own numbers
 
@@ -203,24 +212,24 @@ class StopEvidence:
         return self.learned.interval_s(self.profile.interval_s)
 
     @property
-    def settled_s(self) -> float:
-        """Return the minimum silence before a mode-0 report that counts."""
-        return min(SETTLED_S, SETTLED_SHARE * self.learned.interval_s(FASTEST_S))
+    def min_silence_s(self) -> float:
+        """Return the minimum silence before a report of mode 0, so that it counts."""
+        return min(MIN_SILENCE_S, MIN_SILENCE_SHARE * self.learned.interval_s(FASTEST_S))
 
     @property
-    def _left_s(self) -> float:
-        """Return the maximum time from `MODE00` to the first mode-0 report if that frame closed the mode."""
+    def _leaving_s(self) -> float:
+        """Return the maximum time from the `MODE00` that closed a mode to the first report of mode 0."""
         latest_s = self.close_s + self.interval_s + self._rhythm.tolerance_s
         return min(latest_s + EARLY_S, self.profile.reopened_s + WIRE_S)
 
     @property
     def is_awaited(self) -> bool:
         """Return True if the next report, or the silence after the last one, decides about a `MODE00`."""
-        return self._pending is not None or self.settles_at is not None
+        return self._mode_00_at is not None or self.settles_at is not None
 
     @property
     def settling_s(self) -> float:
-        """Return the time after the last pause within which a report follows if the link had held the one before."""
+        """Return the time to wait after the last pause. If the link had held its report, the next comes earlier."""
         return max(0.0, self.interval_s - self.close_s) + SETTLING_S
 
     # ------------------------------------------------------------------ frames
@@ -229,9 +238,9 @@ class StopEvidence:
         """Forget everything except what was learned, because the link is new."""
         self.reacted_at = None
         self._last_at = self._foreign_at = _NEVER
-        self._window_s = 0.0
+        self._older_reports_s = 0.0
         self.reset_times()
-        self.sent_motion()
+        self.on_motion()
 
     def begin_stop(self) -> None:
         """Prepare for another stop. Keep the pauses of the last stop, but not its control."""
@@ -239,233 +248,247 @@ class StopEvidence:
         self._controlled = False
         self._delayed = 0
 
-    def sent_motion(self) -> None:
+    def on_motion(self) -> None:
         """Drop the evidence, because the car may drive now."""
         self._drop_pauses()
-        if self._pending is not None:  # it will not be judged any more, but it blocks the car
-            self._blocking.append(_Block(None, self.close_s, self._pending))
-        self._pending = self.settles_at = None
-        self._general = True
-        self._leave_nothing()
+        if self._mode_00_at is not None:  # that `MODE00` will not be judged any more, but it blocks the car
+            self._blocks.append(_Block(None, self.close_s, self._mode_00_at))
+        self._mode_00_at = self.settles_at = None
+        self._other_frame_written = True
+        self._forget_mode()
 
-    def opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
+    def on_mode_opened(self, mode: Mode, now: float, *, silent: bool, shown: bool) -> None:
         """Record the opening of a mode. If `shown`, the car had shown its rest before."""
-        self.sent_motion()
-        self._before = self._before_no_echo = None
+        self.on_motion()
+        self._echo_report_at = self._no_echo_report_at = None
         self._opened_at = now
-        self._plain = True
+        self._closed_alone = True
         self._silent_mode = mode if silent and shown else None
 
-    def sent_other(self) -> None:
+    def on_other_frame(self) -> None:
         """Record a frame that neither moves the car nor closes a mode."""
-        self._general = self._unjudged = True
+        self._other_frame_written = self._unjudged = True
         self.settles_at = None
         if self._closed_at is None:
-            self._plain = False
+            self._closed_alone = False
 
-    def blocked(self, kind: Blocking | None, block_s: float, now: float) -> None:
-        """Record a frame that blocks the car for at most `block_s`, and so delays the next report."""
+    def on_block(self, kind: Blocking | None, block_s: float, now: float) -> None:
+        """Record a frame other than `MODE00`, if it blocks the car, for at most `block_s`, and so delays a report."""
         if block_s > FRAME_S:
-            self._blocking.append(_Block(kind, block_s, now))
+            self._blocks.append(_Block(kind, block_s, now))
 
-    def closed(self, now: float, *, awake: bool) -> None:
+    def on_mode_00(self, now: float, *, awake: bool) -> None:
         """Record a `MODE00`. With `awake`, no frame of ours blocks the car, so the pause will be exactly its block."""
-        self._pending = now if awake else None
+        self._mode_00_at = now if awake else None
         if not awake:
-            self._blocking.append(_Block(None, self.close_s, now))  # so that this interval does not count
-        self._delay_s = None
+            self._blocks.append(_Block(None, self.close_s, now))  # so that this interval does not count
+        self._first_delay_s = None
         self._unjudged = False
         self.settles_at = None
         if self._closed_at is None:
             self._closed_at = now
         else:
-            self._plain = False
+            self._closed_alone = False
 
-    def tried_again(self) -> None:
+    def on_retry(self) -> None:
         """Allow for the round trip of a slow link from now on."""
-        self._window_s = ROUND_TRIP_S
+        self._older_reports_s = ROUND_TRIP_S
 
     # ------------------------------------------------------------------ readings
 
     def on_noise(self, at: float, *, damaged: bool = True) -> None:
         """Record bytes that are not readings. With `damaged`, they begin like a frame: the next may be damaged, too."""
         self._last_at = at
-        self._before = self._before_no_echo = self.settles_at = None
-        self._fast_before = False
+        self._echo_report_at = self._no_echo_report_at = self.settles_at = None
+        self._ended_with_echo = False
         if damaged:
             self._foreign_at = at
 
     def reset_times(self) -> None:
         """Drop the evidence that depends on times, because a stall of the loop made the times of reports wrong."""
-        self._before = self._before_no_echo = self._pending = self.settles_at = None
+        self._echo_report_at = self._no_echo_report_at = self._mode_00_at = self.settles_at = None
         self._drop_pauses()
 
-    def is_settled(self, event: Sensors) -> bool:
-        """Return False for a report of mode 0 just after other frames, as it may be a corrupted one of another mode."""
-        return event.at - self._foreign_at >= self.settled_s or Mode.MANUAL not in candidate_modes(event)
+    def is_credible(self, event: Sensors) -> bool:
+        """Return False for a report of mode 0 just after other frames: it may be a damaged frame of another mode."""
+        return event.at - self._foreign_at >= self.min_silence_s or Mode.MANUAL not in candidate_modes(event)
 
     def on_reading(self, event: Sensors) -> Finding:
         """Record a reading, and return its finding."""
-        at, quiet_s = event.at, event.at - self._last_at
+        at, silence_s = event.at, event.at - self._last_at
+        has_echo, is_report = bool(event.range_cm), Mode.MANUAL in candidate_modes(event)
         self._last_at = at
-        self.found_out = False
+        self.changed_expectation = False
         # If this report comes a normal interval after the last pause, the link did not hold the report before it.
-        on_time = self.settles_at is not None and quiet_s >= self.interval_s - self._rhythm.tolerance_s
-        if on_time and Mode.MANUAL in candidate_modes(event):
-            self._before, self._blocking, self._general = at if event.range_cm else None, [], False
-            self._fast_before = bool(event.range_cm)
-            return self._obeyed(at)
+        on_time = self.settles_at is not None and silence_s >= self.interval_s - self._rhythm.tolerance_s
+        if on_time and is_report:
+            self._echo_report_at = at if has_echo else None
+            self._ended_with_echo = has_echo
+            self._blocks, self._other_frame_written = [], False
+            return self._on_obeyed(at)
         self.settles_at = None
-        if Mode.MANUAL not in candidate_modes(event):
-            self._other_mode(at)
+        if not is_report:
+            self._on_other_mode(at)
             return Finding.NOTHING
-        self._shapes = 0
-        if quiet_s < self.settled_s:
-            self._learn_faster(event, quiet_s)
-            self._before = self._before_no_echo = None
-            if quiet_s < min(BUNCHED_S, BUNCHED_SHARE * self.learned.interval_s(FASTEST_S)):
+        self._other_mode_readings = 0
+        if silence_s < self.min_silence_s:
+            self._learn_faster(at, silence_s, has_echo=has_echo)
+            self._echo_report_at = self._no_echo_report_at = None
+            if silence_s < min(BUNCHED_S, BUNCHED_SHARE * self.learned.interval_s(FASTEST_S)):
                 self._drop_pauses()
             return Finding.NOTHING
-        self._fast_before = bool(event.range_cm)
-        if event.range_cm is None:  # the frame is corrupted, and does not show whether there is an echo
-            self._before = self._before_no_echo = None
+        self._ended_with_echo = has_echo
+        if event.range_cm is None:  # the frame is damaged, and does not show whether there is an echo
+            self._echo_report_at = self._no_echo_report_at = None
             return Finding.NOTHING
-        before, self._before = self._before, at if event.range_cm else None
-        before_no_echo, self._before_no_echo = self._before_no_echo, None if event.range_cm else at
-        blocking = self._blocking
-        # A frame that was written just before this report, or in the ranging before it, may be read after it.
-        read_late_s = READ_LATE_S + (0.0 if event.range_cm else self.profile.ranging_s)
-        self._blocking = [each for each in blocking if at - each.at < read_late_s]
-        general, self._general = self._general, False
-        self.without_echo = 0 if event.range_cm else self.without_echo + 1
-        within_s = self._left_s if event.range_cm else self._left_s + self.profile.ranging_s
-        left = self._left(at, quiet_s, within_s)
+        return self._on_report(at, silence_s, has_echo=has_echo)
+
+    def _on_report(self, at: float, silence_s: float, *, has_echo: bool) -> Finding:
+        """Judge a report of mode 0 after a silence."""
+        ranging_s = 0.0 if has_echo else self.profile.ranging_s  # without an echo, the ranging delays the report
+        before, self._echo_report_at = self._echo_report_at, at if has_echo else None
+        before_no_echo, self._no_echo_report_at = self._no_echo_report_at, None if has_echo else at
+        # A car may read a frame only after it has sent this report, if the frame was written just before the report or
+        # during its ranging. So such a frame may also block the next report.
+        blocks, self._blocks = self._blocks, [each for each in self._blocks if at - each.at < READ_LATE_S + ranging_s]
+        other_written, self._other_frame_written = self._other_frame_written, False
+        self.without_echo = 0 if has_echo else self.without_echo + 1
+        left = self._judge_leaving(at, silence_s, self._leaving_s + ranging_s)
         if left is Finding.SHOWN:
-            return self._obeyed(at)
-        if left is Finding.PAUSE and event.range_cm:
-            return self._left_late(at)
-        pending = self._pending
-        if not event.range_cm:
-            if before_no_echo is not None and pending is None and not blocking:
-                self.learned.add_interval(at - before_no_echo, echo=False)
-            if pending is not None and at > pending + self.close_s + self.profile.ranging_s:
-                self._pending = None  # if it blocked a report, it was this one
-            return Finding.NO_ECHO
-        if pending is None:
-            return self._without_mode_00(before, at, blocking, general=general)
+            return self._on_obeyed(at)
+        if not has_echo:
+            return self._on_report_without_echo(before_no_echo, at, blocks)
+        if left is Finding.PAUSE:
+            return self._count_late_leaving(at)
+        mode_00_at = self._mode_00_at
+        if mode_00_at is None:
+            return self._without_mode_00(before, at, blocks, other_written=other_written)
         if before is None:
-            if at <= pending + self.close_s - EARLY_S:
+            if at <= mode_00_at + self.close_s - EARLY_S:
                 return Finding.NOTHING
-            self._pending = None
-            return self._report
+            self._mode_00_at = None
+            return self._report_finding
         if not self._rhythm.is_known:
-            if at > pending + self.close_s - EARLY_S:
-                self._pending = None
+            if at > mode_00_at + self.close_s - EARLY_S:
+                self._mode_00_at = None
             return Finding.UNJUDGED
-        return self._compare(before, pending, at, blocking)
+        return self._judge_interval(before, mode_00_at, at, blocks)
+
+    def _on_report_without_echo(self, before: float | None, at: float, blocks: list[_Block]) -> Finding:
+        """Learn from the interval of two reports without an echo. `MODE00` is not judged by it."""
+        if self._mode_00_at is None:
+            if before is not None and not blocks:
+                self.learned.add_interval(at - before, echo=False)
+        elif at > self._mode_00_at + self.close_s + self.profile.ranging_s:
+            self._mode_00_at = None  # if that `MODE00` blocked a report, it was this one
+        return Finding.NO_ECHO
 
     def settle(self, now: float) -> bool:
         """Return True if the pauses count from now on, because no reading has followed them too early."""
         if self.settles_at is None or now < self.settles_at:
             return False
         self.settles_at = None
-        self._obeyed(self._last_at)
+        self._on_obeyed(self._last_at)
         return True
 
     @property
-    def _report(self) -> Finding:
+    def _report_finding(self) -> Finding:
         is_judged = self._rhythm.is_known and not (self._misfits >= MISFITS and self._rhythm.is_changing)
         return Finding.REPORT if is_judged else Finding.UNJUDGED
 
-    def _without_mode_00(self, before: float | None, at: float, blocking: list[_Block], *, general: bool) -> Finding:
+    def _without_mode_00(
+        self, before: float | None, at: float, blocks: list[_Block], *, other_written: bool
+    ) -> Finding:
         """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
         if before is None:
-            if general:
+            if other_written:
                 self._drop_pauses()  # there was damage instead of a report after the control
-            return self._report
+            return self._report_finding
         gap_s = at - before
-        if not blocking:
-            if general and self._rhythm.is_known:
+        if not blocks:
+            if other_written and self._rhythm.is_known:
                 self._controlled = self._rhythm.fits(gap_s)
                 if not self._controlled:
                     self._drop_pauses()  # writing makes the link lose reports
-                    return self._report
+                    return self._report_finding
             self._learn_interval(gap_s)
-        elif len(blocking) == 1 and (kind := blocking[0].kind) is not None and self._rhythm.is_known:
-            expected_s = blocking[0].block_s
+        elif len(blocks) == 1 and (kind := blocks[0].kind) is not None and self._rhythm.is_known:
+            expected_s = blocks[0].block_s
             delay_s = gap_s - self._rhythm.median_s
             self.learned.add_delay(kind, delay_s, self.profile.reopened_s, controlled=True)
             if abs(delay_s - self.learned.block_s(kind, expected_s)) <= self._rhythm.tolerance_s:
                 self.learned.on_reaction(sure=True)
                 self.reacted_at = at
             elif self._rhythm.fits(gap_s) and expected_s > 2 * self._rhythm.tolerance_s:
-                self.found_out = self.learned.on_no_reaction()
-        return self._report
+                self.changed_expectation = self.learned.on_no_reaction()
+        return self._report_finding
 
-    def _learn_faster(self, event: Sensors, quiet_s: float) -> None:
+    def _learn_faster(self, at: float, silence_s: float, *, has_echo: bool) -> None:
         """Learn the rhythm of a car that reports faster than before."""
-        if self._pending is not None and event.at > self._pending + self._left_s + ROUND_TRIP_S:
-            self._pending = None  # its block is over, and no report in the earlier rhythm can judge it
-        clean = self._fast_before and self._pending is None and not self._blocking
-        self._fast_before = bool(event.range_cm)
-        if clean and event.range_cm and quiet_s >= SETTLED_SHARE * FASTEST_S:
-            self._learn_interval(quiet_s)
+        if self._mode_00_at is not None and at > self._mode_00_at + self._leaving_s + ROUND_TRIP_S:
+            self._mode_00_at = (
+                None  # the block of that `MODE00` is over, and no report in the earlier rhythm can judge it
+            )
+        clean = self._ended_with_echo and self._mode_00_at is None and not self._blocks
+        self._ended_with_echo = has_echo
+        if clean and has_echo and silence_s >= MIN_SILENCE_SHARE * FASTEST_S:
+            self._learn_interval(silence_s)
 
     def _learn_interval(self, gap_s: float) -> None:
         if self.learned.add_interval(gap_s, echo=True):
-            self.found_out = True
+            self.changed_expectation = True
             self._misfits = 0
             self._drop_pauses()
 
-    def _compare(self, before: float, pending: float, at: float, blocking: list[_Block]) -> Finding:
-        """Judge the interval of two reports. `MODE00` was written at `pending`."""
-        gap_s, after_s, rhythm, close_s = at - before, at - pending, self._rhythm, self.close_s
+    def _judge_interval(self, before: float, mode_00_at: float, at: float, blocks: list[_Block]) -> Finding:
+        """Judge the interval of two reports. `MODE00` was written at `mode_00_at`."""
+        gap_s, after_s, rhythm, close_s = at - before, at - mode_00_at, self._rhythm, self.close_s
         delay_s, tolerance_s = gap_s - rhythm.median_s, rhythm.tolerance_s
-        blocked_s = sum(each.block_s for each in blocking)
+        blocked_s = sum(each.block_s for each in blocks)
         # A block cannot delay a report by more than the time since its frame. A longer delay comes from the link.
         is_possible = after_s > IN_FLIGHT_S and delay_s <= after_s + EARLY_S
-        if pending >= before and is_possible and not blocking:
-            self._delay_s = delay_s
+        if mode_00_at >= before and is_possible and not blocks:
+            self._first_delay_s = delay_s
         if after_s <= close_s - EARLY_S:
             return Finding.NOTHING
         matches = -tolerance_s <= delay_s - close_s <= blocked_s + tolerance_s
         longer = -tolerance_s <= delay_s - close_s <= LONGER_S
         if close_s > 2 * tolerance_s and (matches or longer):
-            self._pending = None
+            self._mode_00_at = None
             # Require more pauses if there are too few intervals to know their spread, or if an earlier `MODE00`, which
             # was not judged, may have delayed this report.
             seen_s = rhythm.seen_tolerance_s
             is_close = -seen_s <= delay_s - close_s <= blocked_s + seen_s
-            if not is_close or any(each.kind is None for each in blocking):
+            if not is_close or any(each.kind is None for each in blocks):
                 self._pauses_needed = PAUSES_IN_DOUBT
-            return self._pause(at, delay_s, learn=not matches)
-        if after_s <= self._window_s and gap_s <= rhythm.median_s + SAME_S:
+            return self._count_pause(at, delay_s, learn=not matches)
+        if after_s <= self._older_reports_s and gap_s <= rhythm.median_s + SAME_S:
             return Finding.NOTHING
-        self._pending = None
-        first_delay_s, self._delay_s = self._delay_s, None
-        if first_delay_s is not None and self._agrees(first_delay_s):
-            self._pauses = self._pauses_needed  # equal delays: this car blocks for another time than expected
-            return self._pause(at, first_delay_s)
-        # Here the interval is no pause. If the rhythm is not firm yet, let it become firm first.
-        other = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
-        # A delay up to this counts as none.
-        none_s = max(SAME_S, 2 * tolerance_s) if rhythm.is_firm else tolerance_s
-        if abs(delay_s) > none_s:
+        self._mode_00_at = None
+        first_delay_s, self._first_delay_s = self._first_delay_s, None
+        if first_delay_s is not None and self._count_other_delay(first_delay_s):
+            # This car blocks for another time than expected. The equal delays before this one were pauses, too.
+            self._pauses = self._pauses_needed
+            return self._count_pause(at, first_delay_s)
+        # Here the interval is no pause. If the rhythm is not firm yet, let it become firm before the next `MODE00`.
+        no_pause = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
+        max_spread_s = max(SAME_S, 2 * tolerance_s) if rhythm.is_firm else tolerance_s
+        if abs(delay_s) > max_spread_s:
             self._drop_pauses()
             self._misfits += 1
-            return Finding.UNJUDGED if self._misfits >= MISFITS else other
-        if first_delay_s is not None and abs(first_delay_s) > none_s:
-            return other
+            return Finding.UNJUDGED if self._misfits >= MISFITS else no_pause
+        if first_delay_s is not None and abs(first_delay_s) > max_spread_s:
+            return no_pause
         self._misfits = 0
         self._drop_pauses()
-        if not blocking and rhythm.fits(gap_s):
+        if not blocks and rhythm.fits(gap_s):
             self._learn_interval(gap_s)
         if self.profile.close_s > 2 * tolerance_s:
-            self.found_out = self.learned.on_no_reaction() or self.found_out
+            self.changed_expectation = self.learned.on_no_reaction() or self.changed_expectation
         return Finding.LOST
 
-    def _agrees(self, delay_s: float) -> bool:
-        """Count a delay other than the expected block. Return True if the last ones agree, with enough of this stop."""
+    def _count_other_delay(self, delay_s: float) -> bool:
+        """Count a delay that is not the expected block. Return True if enough delays of this stop agree."""
         self._delayed += 1
         return self._add_close(delay_s) and self._delayed >= PAUSES
 
@@ -474,11 +497,11 @@ class StopEvidence:
         kind, longest_s = Blocking.MODE_CLOSE, self.profile.reopened_s
         return self.learned.add_delay(kind, delay_s, longest_s, controlled=self._controlled)
 
-    def _pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
+    def _count_pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
         """Count a pause. With `learn`, its length is not the expected one, but may be the block of this car."""
         self._pauses += 1
         self.reacted_at = at
-        self._delay_s = None
+        self._first_delay_s = None
         self._misfits = 0
         self.learned.on_reaction(sure=self._controlled or not self.learned.is_confusable(delay_s))
         if learn:
@@ -494,32 +517,36 @@ class StopEvidence:
     def _drop_pauses(self) -> None:
         self._pauses, self._pauses_needed, self._controlled = 0, PAUSES, False
 
-    def _other_mode(self, at: float) -> None:
-        self._shapes += 1
+    def _on_other_mode(self, at: float) -> None:
+        """Record a reading in the form of another mode."""
+        self._other_mode_readings += 1
         self._foreign_at = at
-        self._before = self._before_no_echo = None
-        self._fast_before = False
+        self._echo_report_at = self._no_echo_report_at = None
+        self._ended_with_echo = False
         self._drop_pauses()
-        if self._shapes >= SHAPES or self._shape_at is not None:
-            self._shape_at = at
+        if self._other_mode_readings >= OTHER_MODE_READINGS or self._other_mode_at is not None:
+            self._other_mode_at = at
             self._silent_mode = None
 
-    def _left(self, at: float, quiet_s: float, within_s: float) -> Finding:
-        """Return SHOWN if this report shows that `MODE00` alone closed the mode, PAUSE if it is too late for that."""
+    def _judge_leaving(self, at: float, silence_s: float, within_s: float) -> Finding:
+        """Return SHOWN if this report shows that `MODE00` alone closed the mode, PAUSE if it comes too late for that.
+
+        `within_s` is the maximum time from `MODE00` to a report that shows it.
+        """
         closed_at = self._closed_at
-        shape_at, silent = self._shape_at, self._silent_mode
+        other_mode_at, silent = self._other_mode_at, self._silent_mode
         if closed_at is None or at <= closed_at + self.close_s - EARLY_S:
             return Finding.NOTHING
         opening_s = self.profile.shortest_opening_s
         # Opening the mode blocks for at least this time. Meanwhile a slow link may deliver older reports, so a shorter
         # silence is no evidence.
         earliest_at = self._opened_at + opening_s + self.close_s - EARLY_S
-        if silent is not None and (quiet_s < opening_s - LATE_S or at < earliest_at):
+        if silent is not None and (silence_s < opening_s - LATE_S or at < earliest_at):
             return Finding.NOTHING
-        self._shape_at = self._silent_mode = None
-        if not self._plain or at > closed_at + within_s + LATE_S:
+        self._other_mode_at = self._silent_mode = None
+        if not self._closed_alone or at > closed_at + within_s + LATE_S:
             return Finding.NOTHING
-        if silent is None and (shape_at is None or shape_at > closed_at + SHAPE_UNTIL_S):
+        if silent is None and (other_mode_at is None or other_mode_at > closed_at + OTHER_MODE_LINGERS_S):
             return Finding.NOTHING
         mode = "the mode that it reported" if silent is None else silent
         self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {mode}"
@@ -527,24 +554,27 @@ class StopEvidence:
         is_judged = at <= closed_at + within_s and not self._unjudged and self.learned.shows is Shows.YES
         return Finding.SHOWN if is_judged else Finding.PAUSE
 
-    def _left_late(self, at: float) -> Finding:
+    def _count_late_leaving(self, at: float) -> Finding:
+        """Count a report that shows too late that the car left its mode. It is the first pause, no more."""
         self.reacted_at = at
-        self._pending = None
+        self._mode_00_at = None
         self._drop_pauses()
         self._pauses = 1
         return Finding.PAUSE
 
-    def _obeyed(self, at: float) -> Finding:
+    def _on_obeyed(self, at: float) -> Finding:
+        """Begin anew, because the stop is shown."""
         self.reacted_at = at
-        self._pending = None
+        self._mode_00_at = None
         self.settles_at = None
         self._drop_pauses()
-        self._window_s = 0.0
-        self._leave_nothing()
+        self._older_reports_s = 0.0
+        self._forget_mode()
         self.learned.on_shown()
         return Finding.SHOWN
 
-    def _leave_nothing(self) -> None:
-        self._shapes = 0
-        self._shape_at = self._silent_mode = self._closed_at = None
-        self._plain = False
+    def _forget_mode(self) -> None:
+        """Forget what could show that the car left a mode."""
+        self._other_mode_readings = 0
+        self._other_mode_at = self._silent_mode = self._closed_at = None
+        self._closed_alone = False

@@ -72,7 +72,7 @@ class EvidenceWatch:
 
     def closed(self, at: float, *, awake: bool = True) -> None:
         """Record that `MODE00` was written."""
-        self.evidence.closed(at, awake=awake)
+        self.evidence.on_mode_00(at, awake=awake)
 
     def pause(self, at: float, block_s: float = BLOCK_S) -> Finding:
         """Feed a report at `at`, a `MODE00`, and the report after its pause. Return the finding."""
@@ -120,7 +120,7 @@ def test_two_pauses_show_a_stop_and_one_does_not(interval_s: float) -> None:
     first = watch.pause(10.0)
     assert first is (CONTROL if watch.learned.is_confusable(BLOCK_S) else PAUSE)
     if first is CONTROL:
-        watch.evidence.sent_other()
+        watch.evidence.on_other_frame()
         assert watch.reports(10.0 + each_s + interval_s) == [REPORT]
         assert watch.pause(10.0 + each_s + 2 * interval_s) is SHOWN
     else:
@@ -141,7 +141,7 @@ def test_three_pauses_are_needed_if_one_exceeds_block() -> None:
 def test_pause_with_second_block_may_be_longer() -> None:
     watch = EvidenceWatch()
     watch.reports(10.0)
-    watch.evidence.blocked(Blocking.WHISTLE, 0.3, 10.1)
+    watch.evidence.on_block(Blocking.WHISTLE, 0.3, 10.1)
     watch.closed(10.5)
     assert watch.reports(12.35) == [PAUSE]
     watch.closed(12.4)
@@ -153,7 +153,7 @@ def test_the_frame_that_is_judged_is_the_last_one() -> None:
     watch = EvidenceWatch()
     assert watch.pause(10.0) is PAUSE
     watch.closed(12.3)
-    watch.evidence.sent_other()
+    watch.evidence.on_other_frame()
     assert watch.reports(14.5) == [PAUSE]
     watch.closed(14.6)
     assert watch.reports(16.75) == [SETTLING]
@@ -169,7 +169,7 @@ def unlike(watch: EvidenceWatch, at: float, delay_s: float, *, closed_s: float =
 def test_delays_of_a_stop_before_show_no_other_stop() -> None:
     watch = EvidenceWatch()
     assert SETTLING in [found for number in range(3) for found in unlike(watch, 10.0 + 6 * number, 0.6)]
-    watch.evidence.sent_motion()
+    watch.evidence.on_motion()
     watch.evidence.begin_stop()
     watch.learned.forget_reactions()
     for _ in range(2):
@@ -187,7 +187,7 @@ def test_delay_longer_than_time_since_mode_00_is_not_its_own() -> None:
 def test_pauses_before_a_motion_do_not_count() -> None:
     watch = EvidenceWatch()
     assert watch.pause(40.0) is PAUSE
-    watch.evidence.sent_motion()
+    watch.evidence.on_motion()
     assert watch.pause(43.5) is PAUSE, "the car may have moved since the first one"
 
 
@@ -213,7 +213,7 @@ def test_non_blocking_frame_is_control_where_ambiguous(interval_s: float) -> Non
                 break
         assert found not in (SETTLING, SHOWN)
         if found is CONTROL:
-            watch.evidence.sent_other()
+            watch.evidence.on_other_frame()
         else:
             watch.closed(at + 0.01)
     assert watch.learned.shows is Shows.YES, "only a car that was never seen to react cannot show a stop"
@@ -257,9 +257,9 @@ def test_report_too_early_after_last_pause_was_held_by_link(interval_s: float) -
     watch = EvidenceWatch(known(interval_s))
     each_s = interval_s + BLOCK_S
     if watch.pause(10.0) is CONTROL:
-        watch.evidence.sent_other()
+        watch.evidence.on_other_frame()
     else:
-        watch.evidence.sent_other()  # in both cases one interval without a MODE00
+        watch.evidence.on_other_frame()  # in both cases one interval without a MODE00
     at = 10.0 + each_s + interval_s
     watch.reports(at)
     watch.closed(at + 0.05)
@@ -301,7 +301,7 @@ def test_a_loop_that_slept_has_perhaps_taken_reports_late() -> None:
 def test_slow_link_has_more_time_from_second_try() -> None:
     watch = EvidenceWatch()
     watch.reports(9.5)
-    watch.evidence.tried_again()
+    watch.evidence.on_retry()
     watch.closed(10.0)
     assert watch.reports(10.75, 12.0) == [NOTHING, NOTHING]
     assert watch.reports(13.25) == [LOST]
@@ -342,7 +342,7 @@ def test_three_delays_that_agree_are_the_block_of_this_car(block_s: float) -> No
     for number in range(6):
         at = 10.0 + number * (3 * INTERVAL_S + block_s)
         found.append(watch.pause(at, block_s))
-        watch.evidence.sent_other()
+        watch.evidence.on_other_frame()
         watch.reports(at + 2 * INTERVAL_S + block_s)  # the control: on time
     assert SHOWN in found
     assert found.index(SHOWN) + 1 >= AGREEING_DELAYS
@@ -355,7 +355,7 @@ def test_a_car_that_never_reacts_cannot_show_a_stop() -> None:
     found_out = []
     for number in range(UNREACTED):
         assert watch.pause(10.0 + 5 * number, 0.0) is LOST
-        found_out.append(watch.evidence.found_out)
+        found_out.append(watch.evidence.changed_expectation)
     assert found_out == [False] * (UNREACTED - 1) + [True]
     assert watch.learned.shows is Shows.NO
 
@@ -372,7 +372,7 @@ def test_a_whistle_that_delays_a_report_is_a_reaction_too() -> None:
     for number in range(UNREACTED - 1):
         watch.pause(10.0 + 5 * number, 0.0)
     watch.reports(40.0)
-    watch.evidence.blocked(Blocking.WHISTLE, 0.3, 40.1)
+    watch.evidence.on_block(Blocking.WHISTLE, 0.3, 40.1)
     watch.reports(40.0 + INTERVAL_S + 0.304)
     assert watch.pause(50.0, 0.0) is LOST
     assert watch.learned.shows is Shows.UNKNOWN, "the count began anew"
@@ -394,7 +394,7 @@ def test_changed_report_interval_resets_shown_evidence(interval_s: float) -> Non
 def tracking(until: float, learned: Learned | None = None) -> EvidenceWatch:
     """Return the evidence of a car that reports in tracking."""
     watch = EvidenceWatch(learned)
-    watch.evidence.opened(Mode.TRACKING, 0.0, silent=False, shown=True)
+    watch.evidence.on_mode_opened(Mode.TRACKING, 0.0, silent=False, shown=True)
     for number in range(40):
         assert watch.evidence.on_reading(event(TRACKING, until - 2.0 + 0.05 * number)) is NOTHING
     return watch
@@ -404,7 +404,7 @@ def silent(*, shown: bool = True) -> EvidenceWatch:
     """Return the evidence of a car with color LED mode opened at 5.0."""
     watch = EvidenceWatch()
     watch.reports(4.9)
-    watch.evidence.opened(Mode.COLOR_LED, 5.0, silent=True, shown=shown)
+    watch.evidence.on_mode_opened(Mode.COLOR_LED, 5.0, silent=True, shown=shown)
     return watch
 
 
@@ -446,7 +446,7 @@ def test_only_blocking_car_shows_left_mode_by_one_report(shows: Shows) -> None:
 def test_a_general_stop_after_mode00_leaves_the_report_unjudged() -> None:
     watch = tracking(10.0)
     watch.closed(10.0)
-    watch.evidence.sent_other()
+    watch.evidence.on_other_frame()
     assert watch.reports(11.5) == [PAUSE]
 
 
@@ -469,7 +469,7 @@ def test_single_report_on_slow_link_counts_as_pause(mode: Mode, late_s: float, f
 def test_stop_is_not_shown_if_mode00_was_not_first_frame(mode: Mode, first: str) -> None:
     watch = tracking(10.0) if mode is Mode.TRACKING else silent()
     if first == "other":
-        watch.evidence.sent_other()
+        watch.evidence.on_other_frame()
     else:
         watch.closed(9.0)
     watch.closed(10.0)
@@ -486,7 +486,7 @@ def test_mode_shape_long_after_mode00_shows_the_opposite() -> None:
 
 def test_one_damaged_reading_is_no_mode_that_was_seen() -> None:
     watch = EvidenceWatch()
-    watch.evidence.opened(Mode.TRACKING, 0.0, silent=False, shown=True)
+    watch.evidence.on_mode_opened(Mode.TRACKING, 0.0, silent=False, shown=True)
     watch.evidence.on_reading(event(TRACKING, 9.0))
     watch.closed(10.0)
     assert watch.reports(11.95)[-1] is not SHOWN
