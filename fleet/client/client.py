@@ -43,7 +43,7 @@ from fleet.client.commands import (
 from fleet.client.condition import KeyCondition, check_car, check_key
 from fleet.client.job_threads import JobThreads
 from fleet.client.lease import Lease
-from fleet.client.lost_hub import explained
+from fleet.client.lost_hub import explain_no_fleet
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
 from fleet.client.pose import pose_message
 from fleet.client.reading import Reading, Watch, reading_of
@@ -131,7 +131,7 @@ class Fleet:
         try:
             self.bus = Bus.open(endpoint, start_hub=start_hub, identity=identity)
         except NoFleet as error:
-            raise explained(error) from None
+            raise explain_no_fleet(error) from None
         try:
             self.sender = certified_sender(self.bus.identity, sender, person)
         except keys.BadKey:
@@ -361,7 +361,7 @@ class Fleet:
         self._check_open()
         cars = [cars] if isinstance(cars, str) else cars  # a str is an iterable of letters
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
-        message, command_id = self._filled(request)
+        message, command_id = self._fill(request)
         payload = message.SerializeToString()
         pool = self._stop_pool if request.until is Until.STOPPED else self._pool
 
@@ -406,7 +406,7 @@ class Fleet:
             command_log.info("%s: %s %s", each.car, command.request.verb, each.phase, extra=extra)
         return found
 
-    def _filled(self, request: CommandRequest) -> tuple[Any, str]:
+    def _fill(self, request: CommandRequest) -> tuple[Any, str]:
         message = type(request.message)()
         message.CopyFrom(request.message)
         message.id = uuid.uuid4().hex
@@ -510,4 +510,4 @@ class LeasedCar(Car):
     def do(self, request: CommandRequest) -> Outcome:
         """Send one command. Raises NotCarriedOut, or LeaseLost if another sender has taken or stopped the car."""
         self._lease.check()
-        return self._lease.checked(super().do(request))
+        return self._lease.check_outcome(super().do(request))

@@ -50,7 +50,7 @@ class KeySurvey:
         """Add a reading."""
         if reading.age_s(now) <= self._duration_s:
             first = self._first.get(reading.key)
-            if first is None or reading.time < first.time or _restarted(first, reading):
+            if first is None or reading.time < first.time or _is_other_publisher(first, reading):
                 self._first[reading.key] = reading
         newest = self._newest.get(reading.key)
         if newest is None or reading.time >= newest.time:
@@ -73,7 +73,7 @@ class KeySurvey:
         return KeyInfo(key, topic, rate, newest.age_s(now), newest.stale(now))
 
 
-def _restarted(first: Reading, reading: Reading) -> bool:
+def _is_other_publisher(first: Reading, reading: Reading) -> bool:
     """Return True if the two readings are of different publishers."""
     return bool(getattr(first.value, "boot_id", "") != getattr(reading.value, "boot_id", ""))
 

@@ -109,7 +109,7 @@ class Lease(Generic[C_co]):
         key = keys.topic_key(self._fleet.name, self._name, "state/safety")
         self._undeclare = self._fleet.bus.subscribe(key, self._on_sample).undeclare
         try:
-            self.checked(self._fleet.ask(lease_request(take=self._take), [self._name])[0])
+            self.check_outcome(self._fleet.ask(lease_request(take=self._take), [self._name])[0])
             self._query()  # the message that shows our lease may still be on its way
         except BaseException:
             self._undeclare()
@@ -126,7 +126,7 @@ class Lease(Generic[C_co]):
         finally:
             self._undeclare()
 
-    def checked(self, outcome: Outcome) -> Outcome:
+    def check_outcome(self, outcome: Outcome) -> Outcome:
         """Return the outcome of a command. Raises LeaseLost or NotCarriedOut if the command was not carried out."""
         if outcome.ok:
             return outcome

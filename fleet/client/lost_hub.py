@@ -22,7 +22,7 @@ def describe_running(endpoint: str) -> str:
     return f"gateways run here ({', '.join(cars[:_MAX_CARS_NAMED])}{more}): cars may move" if cars else ""
 
 
-def explained(error: NoFleet) -> BusError:
+def explain_no_fleet(error: NoFleet) -> BusError:
     """Return the error itself, or a LostHub if gateways run without a hub."""
     running = describe_running(error.endpoint)
     if not running:

@@ -29,7 +29,7 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
     for answer in bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=RECORDER_TIMEOUT_S):
         if isinstance(answer, Failure):
             return answer
-        if (found := _recording(answer)) is not None:
+        if (found := _recording_in(answer)) is not None:
             return found
     return None
 
@@ -39,11 +39,11 @@ def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
     for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
         if isinstance(answer, Failure) or not (site := keys.recorder_site(fleet, answer.key.removesuffix("/status"))):
             continue
-        if (found := _recording(answer)) is not None:
+        if (found := _recording_in(answer)) is not None:
             yield site, found
 
 
-def _recording(answer: Sample) -> Any:
+def _recording_in(answer: Sample) -> Any:
     """Return the fleet.v1.Recording in an answer. None for another answer: without certificates, anybody may answer."""
     named = topics.TOPICS["@recorder/status"].message
     return next((each for each in messages_of([answer]) if each.DESCRIPTOR.full_name == named), None)

@@ -55,7 +55,7 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
         for link in links:
             validate_link(link)
     fleet = read(file, unbound=True)
-    found = [each for each in look_for(links, seconds) if each.verdict != LinkVerdict.BUSY and _unknown(each, fleet)]
+    found = [each for each in look_for(links, seconds) if each.verdict != LinkVerdict.BUSY and _is_unknown(each, fleet)]
     if not found:
         raise click.ClickException(
             f"No new car found: all cars that answered are in {file} already. Is the new car switched on? "
@@ -74,13 +74,13 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
                 car = _which(client, name, file)
             if car != _NO_CAR:
                 _write(file, car, each.url)
-    left = read(file, unbound=True).unbound
-    if left:
-        click.echo(f"still without a link: {', '.join(left)}")
-    raise SystemExit(1 if left else 0)
+    unbound = read(file, unbound=True).unbound
+    if unbound:
+        click.echo(f"still without a link: {', '.join(unbound)}")
+    raise SystemExit(1 if unbound else 0)
 
 
-def _unknown(found: FoundLink, fleet: FleetFile) -> bool:
+def _is_unknown(found: FoundLink, fleet: FleetFile) -> bool:
     link = parse_link(found.url)
     if link.harm:
         return False

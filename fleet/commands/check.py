@@ -120,7 +120,7 @@ class _Checks:
             self._cars = listed_cars(fleet)
             # `fleet up --sim N` also simulates cars that have a port.
             self._simulated = [name for name, car in fleet.cars.items() if car.link == LINK_SIM] or list(fleet.cars)
-        served = _served(fleet)
+        served = _running_links(fleet)
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
             found = list(pool.map(lambda car: check_link(car, served), fleet.cars.values()))
         widest = max(len(each.car) for each in found)
@@ -207,7 +207,7 @@ def _is_world(cars: Any) -> bool:
     return isinstance(cars, dict) and any(isinstance(each, dict) and "x_m" in each for each in cars.values())
 
 
-def _served(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:
+def _running_links(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:
     """Return state, reason and URL of the link of every running gateway. Empty if no fleet is running."""
     from fleet.client.client import Fleet
 

@@ -95,7 +95,7 @@ def find(
         echo_safely(header)
         for line, (path, hit) in zip(lines, found, strict=True):
             echo_safely(f"{line}\n  {_open_command(path, hit)}")
-    if mark and not _marked(found, expression):
+    if mark and not _mark_sessions(found, expression):
         raise click.exceptions.Exit(1)
     if not found:
         most_s = max((answer.longest_s for _, answer in answers), default=-1.0)
@@ -138,7 +138,7 @@ def _answers(
         raise click.UsageError(f"--car: no session has {', '.join(missing)}: there are {', '.join(sorted(there))}")
 
 
-def _marked(found: list[tuple[Path, "Hit"]], expression: "Expression") -> bool:
+def _mark_sessions(found: list[tuple[Path, "Hit"]], expression: "Expression") -> bool:
     """Mark the first hit of each session. If a session cannot be marked, name it on stderr and return False."""
     hits: dict[Path, list[Hit]] = {}
     for path, hit in found:

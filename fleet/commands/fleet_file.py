@@ -193,12 +193,12 @@ def _prompt_cars(found: list[FoundLink]) -> list[NewCar]:
         if name == _SKIP:
             continue
         platform = prompt(
-            "  its platform", default=each.platform, value_proc=_checked(validate_platform), instead=_TAKE_ALL
+            "  its platform", default=each.platform, value_proc=_prompt_check(validate_platform), instead=_TAKE_ALL
         )
         color = prompt(
             "  its color",
             default=default_color(name, len(cars)),
-            value_proc=_checked(validate_color),
+            value_proc=_prompt_check(validate_color),
             instead=_TAKE_ALL,
         )
         cars.append(NewCar(name, each.url, platform, color, each.words))
@@ -215,7 +215,7 @@ def prompt_name(words: str, offered: str | None, taken: set[str], instead: str =
         likely = re.sub("[^a-z0-9_]+", "-", name.lower()).strip("-_")
         if name != likely and name != _SKIP and keys.is_name(likely):
             raise click.UsageError(f'"{name}" is not a car name: use {keys.NAME_RULE}, such as {likely}.')
-        return name if name == _SKIP else _checked(validate_car_name)(name)
+        return name if name == _SKIP else _prompt_check(validate_car_name)(name)
 
     name: str = prompt(words, default=offered, value_proc=check_name, instead=instead)
     return name
@@ -229,7 +229,7 @@ def prompt(words: str, *, default: str | None, value_proc: Callable[[str], str],
         except click.UsageError as error:
             click.echo(f"fleet: {error.message}")
         except click.Abort as error:
-            raise _unanswered(error, instead) from None
+            raise _error_without_answer(error, instead) from None
 
 
 def confirm(words: str, instead: str = "") -> bool:
@@ -237,10 +237,10 @@ def confirm(words: str, instead: str = "") -> bool:
     try:
         return click.confirm(words)
     except click.Abort as error:
-        raise _unanswered(error, instead) from None
+        raise _error_without_answer(error, instead) from None
 
 
-def _unanswered(error: click.Abort, instead: str) -> click.Abort | click.ClickException:
+def _error_without_answer(error: click.Abort, instead: str) -> click.Abort | click.ClickException:
     """Return the error for a question without an answer. After Ctrl-C, return the same Abort."""
     if isinstance(error.__context__, KeyboardInterrupt):
         return error
@@ -250,13 +250,13 @@ def _unanswered(error: click.Abort, instead: str) -> click.Abort | click.ClickEx
     return click.ClickException(f"Nothing is written without an answer: {why}. Type the command at a terminal{other}.")
 
 
-def _checked(rule: Callable[[str], str]) -> Callable[[str], str]:
+def _prompt_check(rule: Callable[[str], str]) -> Callable[[str], str]:
     """Return the rule as a value processor of a prompt, which repeats the question after an error."""
 
-    def check_it(text: str) -> str:
+    def check(text: str) -> str:
         try:
             return rule(text.strip())
         except ValueError as error:
             raise click.UsageError(str(error)) from None
 
-    return check_it
+    return check

@@ -48,7 +48,7 @@ def client_in(connect: str | None, fleet: str) -> Fleet:
 
 def open_client(connect: str | None, fleet: str, cars: Iterable[str] = ()) -> Fleet:
     """Open the client of `client_in` in the fleet that the command means. Raises click.UsageError."""
-    return _opened(connect, fleet, lambda bus: the_fleet(bus, fleet, cars))
+    return _open_chosen(connect, fleet, lambda bus: the_fleet(bus, fleet, cars))
 
 
 def open_observer(connect: str | None, fleet: str, keyexpr: str = "") -> Fleet:
@@ -56,10 +56,10 @@ def open_observer(connect: str | None, fleet: str, keyexpr: str = "") -> Fleet:
 
     Raises click.UsageError if several fleets could fit.
     """
-    return _opened(connect, fleet, lambda bus: _only_fleet(bus, fleet, keyexpr.partition("/")[0]))
+    return _open_chosen(connect, fleet, lambda bus: _only_fleet(bus, fleet, keyexpr.partition("/")[0]))
 
 
-def _opened(connect: str | None, fleet: str, choose: Callable[[Bus], str]) -> Fleet:
+def _open_chosen(connect: str | None, fleet: str, choose: Callable[[Bus], str]) -> Fleet:
     """Open a client. `choose` gets its bus, and returns the name of the fleet to use."""
     client = client_in(connect, fleet)
     try:

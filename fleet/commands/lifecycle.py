@@ -241,7 +241,7 @@ def _lines(path: Path, *, follow: bool) -> Iterator[str]:
     if before.exists():
         with before.open(encoding="utf-8", errors="replace") as older:
             yield from older
-    file = _opened(path, follow=follow)
+    file = _open_log(path, follow=follow)
     while file is not None:
         with file:
             while True:
@@ -253,10 +253,10 @@ def _lines(path: Path, *, follow: bool) -> Iterator[str]:
                     break
                 else:
                     time.sleep(LOG_POLL_S)
-        file = _opened(path, follow=follow)
+        file = _open_log(path, follow=follow)
 
 
-def _opened(path: Path, *, follow: bool) -> IO[str] | None:
+def _open_log(path: Path, *, follow: bool) -> IO[str] | None:
     while not path.exists():
         if not follow:
             return None

@@ -112,7 +112,7 @@ def show_cars(client: Fleet, only: Sequence[str] = (), *, as_json: bool = False)
         for row in rows:
             click.echo(json.dumps(row))
         return
-    table = [{name: shown(name, row) for name in CAR_COLUMNS} for row in rows]
+    table = [{name: cell_text(name, row) for name in CAR_COLUMNS} for row in rows]
     show_table(CAR_COLUMNS, table, optional=OPTIONAL_CAR_COLUMNS, colors=[row["color"] for row in rows])
     for row in rows:
         if words := describe_clock(row["car"], row["clock_off_s"]):
@@ -173,7 +173,7 @@ def row_of(
     }
 
 
-def shown(name: str, row: Mapping[str, Any]) -> str:
+def cell_text(name: str, row: Mapping[str, Any]) -> str:
     """Return a cell of the table."""
     if name == "battery":
         if row["battery_v"] is None:

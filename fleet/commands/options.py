@@ -12,7 +12,7 @@ import click
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.hints import complete_hints
-from fleet.client.lost_hub import describe_running, explained
+from fleet.client.lost_hub import describe_running, explain_no_fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.client.refused_by_hub import why_refused
 from fleet.commands.fleets import open_client
@@ -115,7 +115,7 @@ def cli_errors() -> Iterator[None]:
             raise WrongFile(str(error)) from None
         raise click.UsageError(complete_hints(str(error), hint_options())) from None
     except BusError as error:
-        words = str(explained(error) if isinstance(error, NoFleet) else error)
+        words = str(explain_no_fleet(error) if isinstance(error, NoFleet) else error)
         raise click.ClickException(complete_hints(words, hint_options())) from None
 
 

@@ -232,14 +232,14 @@ def _flat(_: click.Context, __: click.Parameter, value: tuple[tuple[str, ...], .
     return tuple(dict.fromkeys(name for names in value for name in names))
 
 
-def _needed(ctx: click.Context, param: click.Parameter, value: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
+def _require_cars(ctx: click.Context, param: click.Parameter, value: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
     """Join `red,blue` and `green`. Fail with an example if no car is named."""
     if not value:
-        raise click.UsageError(missing_words(ctx), ctx)
+        raise click.UsageError(describe_missing_words(ctx), ctx)
     return _flat(ctx, param, value)
 
 
-def missing_words(ctx: click.Context) -> str:
+def describe_missing_words(ctx: click.Context) -> str:
     """Return the error text for missing words: what to write, with the first example of the command."""
     pieces = [each for each in ctx.command.collect_usage_pieces(ctx) if each != "[OPTIONS]"]
     example = next(line.strip() for line in (ctx.command.epilog or "").splitlines() if line.startswith("  fleet"))
@@ -250,7 +250,7 @@ def _place(ctx: click.Context, _: click.Parameter, value: Path | None) -> None:
     ctx.meta[_PLACE] = value
 
 
-cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="CAR...", callback=_needed)
+cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="CAR...", callback=_require_cars)
 any_cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]", callback=_flat)
 car_option = click.option(
     "--car", "cars", type=CarNames(), multiple=True, metavar="CAR[,CAR...]", callback=_flat, help="Use only these cars."

@@ -143,7 +143,7 @@ class _ReplanReport:
             if not plans:
                 raise click.ClickException(f"{self._session.path} has no plan: give a plan file after the session")
             again = Replanning(run, plans, self._listed, persisted)
-            persisted = self._one(run, again, tokens)
+            persisted = self._compare_run(run, again, tokens)
 
     def _refuse_without_cars(self) -> None:
         """Reject a session that was cut to some cars: messages on which the decisions depend are missing."""
@@ -161,7 +161,7 @@ class _ReplanReport:
                 f"{', '.join(others)}, whose messages are not in it; try the session from which it was cut"
             )
 
-    def _one(self, run: "CoordinatorRun", again: "Replanning", tokens: "list[PresenceToken]") -> Any:
+    def _compare_run(self, run: "CoordinatorRun", again: "Replanning", tokens: "list[PresenceToken]") -> Any:
         from fleet.replay.analysis.recorded_decisions import differences
         from fleet.replay.analysis.replan import COORDINATOR_HISTORY_NS, keys_for
 

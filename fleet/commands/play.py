@@ -135,7 +135,7 @@ def play(
             origin_s = time.monotonic()
             while not stop.is_set():
                 recorded = found.messages(expressions, from_ns, part.end_ns)
-                player.play(_counted_from(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, progress)
+                player.play(_with_start_at(recorded, from_ns, schedule), schedule, origin_s, stop.is_set, progress)
                 if not player.published and not stop.is_set():
                     why = "".join(f"; {line}" for line in player.left_out.words())
                     raise click.ClickException(f"{session} has no messages there that can be published again{why}")
@@ -164,7 +164,7 @@ def play(
         click.echo(printable_lines(f"only the intact part was published: {found.damage_words}"), err=True)
 
 
-def _counted_from(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:
+def _with_start_at(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:
     """Start the schedule at `from_ns`, so that the time until the first message counts."""
     if from_ns is not None:
         schedule.due_s(from_ns)

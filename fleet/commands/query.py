@@ -94,13 +94,13 @@ def _write(header: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, as_csv: 
     elif as_csv:
         echo_csv(header, ([_cell(cell) for cell in row] for row in rows))
     else:
-        left = iter(rows)
-        if (first := next(left, None)) is None:
+        remaining = iter(rows)
+        if (first := next(remaining, None)) is None:
             click.echo("No rows.", err=True)
             return
         limit = MAX_CELL if sys.stdout.isatty() else sys.maxsize
         titles = tuple(printable(name, limit) for name in header)
-        texts = (tuple(_text(cell, limit) for cell in row) for row in chain((first,), left))
+        texts = (tuple(_text(cell, limit) for cell in row) for row in chain((first,), remaining))
         for line in aligned(chain((titles,), texts)):
             echo_safely(line)
 

@@ -34,13 +34,13 @@ def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: 
             found: tuple[list[str], dict[str, str]] | None = None
             try:
                 bus = bus or Bus.open(connect)
-                found = _missing(bus, fleet)
+                found = _find_missing(bus, fleet)
             except BusError:
                 if time.monotonic() >= deadline:
                     raise
             known, missing = found or ([], {})
             wanted = list(cars or known)
-            missing |= {car: _unknown(car, known) for car in cars if car not in known}
+            missing |= {car: _describe_unknown(car, known) for car in cars if car not in known}
             if cars:
                 missing = {car: missing[car] for car in cars if car in missing}
             if wanted and not missing:
@@ -61,7 +61,7 @@ def wait_ready(connect: str | None, fleet: str, cars: Sequence[str], timeout_s: 
     raise SystemExit(0 if ok else 1)
 
 
-def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
+def _find_missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
     """Return the names of the cars, and by name the reason for each car and service that is not ready."""
     for status in ask_status(bus, fleet):
         cars = [process.name for process in status.processes if not process.name.startswith("@")]
@@ -79,6 +79,6 @@ def _missing(bus: Bus, fleet: str) -> tuple[list[str], dict[str, str]]:
     return sorted(states), {car: why for car, state in sorted(states.items()) if (why := state.why_missing(now))}
 
 
-def _unknown(car: str, known: Sequence[str]) -> str:
+def _describe_unknown(car: str, known: Sequence[str]) -> str:
     near = nearest(car, known)
     return f"no such car{f', did you mean {near}?' if near else ''}"

@@ -154,10 +154,10 @@ class _RedecodeReport:
 def _line(each: "ReadingDifference", start_ns: int) -> str:
     text = each.data.decode("latin-1").encode("unicode_escape").decode("ascii")
     at = f"{(each.at_ns - start_ns) / 1e9:+.3f}s"
-    return f"{each.car} {at} {text}: {each.what} was {_shown(each.then)}, is now {_shown(each.now)}"
+    return f"{each.car} {at} {text}: {each.what} was {_format_value(each.then)}, is now {_format_value(each.now)}"
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, tuple):
         return " ".join(map(str, value)) or "nothing"
     return "not measured" if value is None else str(value)

@@ -279,7 +279,7 @@ async def _serve(
             return
         if detached and event.what in (READY, MISSING):
             event = replace(event, words=complete_hints(f"{event.words} `fleet down` ends it.", supervisor.options))
-        _written(write, event) if table is None else table.on_event(event)
+        _print_event(write, event) if table is None else table.on_event(event)
         if detached and event.what in (READY, MISSING):
             _append_output_to(supervisor.log_path)
 
@@ -336,7 +336,7 @@ async def _pass_stdin(loop: asyncio.AbstractEventLoop, take: Callable[[str], Non
         await loop.connect_read_pipe(lambda: LineProtocol(take), sys.stdin)
 
 
-def _written(write: _Write, event: SupervisorEvent) -> None:
+def _print_event(write: _Write, event: SupervisorEvent) -> None:
     """Print an event. A closed pipe or terminal must not prevent the shutdown."""
     try:
         write(event)

@@ -436,9 +436,9 @@ class Console:
             del self._stop_ids[next(iter(self._stop_ids))]
         operator, request = operator or self.operator, request or stop_request()
         who = (request.sender or operator.sender, request.verb)
-        self._merged(who, partial(self._stop_all, operator, request))
+        self._merge_stop(who, partial(self._stop_all, operator, request))
 
-    def _merged(self, who: tuple[str, ...], stop: Callable[[], object]) -> None:
+    def _merge_stop(self, who: tuple[str, ...], stop: Callable[[], object]) -> None:
         """Stop at once. Further stops of the same kind within MERGE_S are sent as one stop at the end of that time."""
         if len(self._merges) >= _MAX_MERGES:
             del self._merges[next(iter(self._merges))]
@@ -538,7 +538,7 @@ class Console:
             self._end_all(self._presses.drop_cars(set(cars)), "The car was stopped.")
             who = (page.operator.sender, request.verb)
             self._waiting_stops.setdefault(who, []).append((cars, answer))
-            self._merged(("cars", *who), partial(self._stop_cars, page.operator, request, who))
+            self._merge_stop(("cars", *who), partial(self._stop_cars, page.operator, request, who))
             return
         if request.verb == Verb.MODE:
             theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.leads_of(cars))

@@ -194,7 +194,7 @@ def explain_idle(car: str, candidates: Candidates, allocation: RoleAllocation) -
             words, change = "it does not count in this phase", "the next phase begins"
         elif (barrier := candidates.barrier(car, role)) is not None:
             words, change = barrier.why, barrier.change
-            used += candidates.seen(car, barrier)
+            used += candidates.readings_of(car, barrier)
         else:
             holders = allocation.holders(name)
             cars = f"it has its {'car' if len(holders) == 1 else 'cars'}: {', '.join(holders)}"
@@ -253,7 +253,7 @@ def _list_others(
         kinds.append(words)
         if len(whys) < _MAX_REASONS:
             whys.append(words if words.startswith((car, f"the link of {car}")) else f"{car}: {words}")
-            used += candidates.seen(car, barrier)
+            used += candidates.readings_of(car, barrier)
             if barrier is not None:
                 changes.append(f"{car}: {barrier.change}")
     more = f"; and {len(kinds) - _MAX_REASONS} more" if len(kinds) > _MAX_REASONS else ""
@@ -310,7 +310,7 @@ def explain_inactive(name: str, candidates: Candidates, phase: str) -> Decision:
 def explain_origin(car: str, name: str, candidates: Candidates, before: str | None, lost: str) -> HeldRole:
     """Explain how this car got this role. `before` is the car that lost the role, `lost` is the reason."""
     role = candidates.plan.roles[name]
-    used = candidates.snapshot.used(role.needs, car, candidates.now) if role.needs is not None else ()
+    used = candidates.snapshot.describe_readings(role.needs, car, candidates.now) if role.needs is not None else ()
     if before is not None:
         return HeldRole(name, f"in place of {before}: {lost}", used)
     if candidates.snapshot.cars.get(car, UNKNOWN_CAR).mode == role.mode:

@@ -61,11 +61,11 @@ class Candidates:
     needs: Mapping[tuple[str, str], Settled]
     now: float
 
-    def seen(self, car: str, barrier: Barrier | None) -> tuple[str, ...]:
+    def readings_of(self, car: str, barrier: Barrier | None) -> tuple[str, ...]:
         """Return the readings from which a barrier follows."""
         if barrier is None or barrier.looks_at is None:
             return ()
-        return self.snapshot.used(barrier.looks_at, car, self.now)
+        return self.snapshot.describe_readings(barrier.looks_at, car, self.now)
 
     def barrier(self, car: str, role: Role) -> Barrier | None:
         """Return why this car may not have this role, None if it may."""

@@ -112,18 +112,20 @@ def _follow(
     condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, before: Mapping[str, Debounced], now: float
 ) -> Mapping[str, Debounced]:
     if condition.of is Quantifier.ALL:
-        value = _all_of([snapshot.holds(condition.expression, car, now) for car in _watched(condition, cars, before)])
+        value = _all_of(
+            [snapshot.holds(condition.expression, car, now) for car in _watched_cars(condition, cars, before)]
+        )
         debounced = debounce(before.get(_ALL_CARS), value, condition.for_s, now)
         return _NO_CARS if debounced is None else {_ALL_CARS: debounced}
     result = {}
-    for car in _watched(condition, cars, before):
+    for car in _watched_cars(condition, cars, before):
         debounced = debounce(before.get(car), snapshot.holds(condition.expression, car, now), condition.for_s, now)
         if debounced is not None:
             result[car] = debounced
     return result
 
 
-def _watched(condition: PlanCondition, cars: CarSets, before: Mapping[str, Debounced]) -> list[str]:
+def _watched_cars(condition: PlanCondition, cars: CarSets, before: Mapping[str, Debounced]) -> list[str]:
     """Return the cars that the condition is about.
 
     A car that made it true stays, even if the rule gave it a new role.
@@ -150,8 +152,8 @@ def _all_of(each: list[bool | None]) -> bool | None:
 def _readings_used(
     condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, trigger: str | None, now: float
 ) -> tuple[str, ...]:
-    of = [trigger] if trigger is not None else _watched(condition, cars, _NO_CARS)
-    return tuple(reading for car in of for reading in snapshot.used(condition.expression, car, now))
+    of = [trigger] if trigger is not None else _watched_cars(condition, cars, _NO_CARS)
+    return tuple(reading for car in of for reading in snapshot.describe_readings(condition.expression, car, now))
 
 
 def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: Mapping[str, str]) -> Iterator[str]:

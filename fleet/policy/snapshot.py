@@ -197,7 +197,7 @@ class FleetSnapshot:
 
         return expression.value(lookup)
 
-    def used(self, expression: Expression, car: str, now: float) -> tuple[str, ...]:
+    def describe_readings(self, expression: Expression, car: str, now: float) -> tuple[str, ...]:
         """Return texts for a person: the readings that an expression uses, each with its value and age."""
         lines = []
         for name in dict.fromkeys(expression.names):

@@ -283,7 +283,7 @@ class TcpEndpoint(SimEndpoint):
                 self._next = None
                 raise self._cannot_listen(0, error) from None
 
-    def joined(self, transport: asyncio.Transport) -> bool:
+    def admit(self, transport: asyncio.Transport) -> bool:
         """Accept a host; return False for a second one."""
         if self._transport is not None:
             return False
@@ -298,7 +298,7 @@ class TcpEndpoint(SimEndpoint):
         """Pass bytes to the owner."""
         self._owner.received(data)
 
-    def left(self, transport: asyncio.Transport) -> None:
+    def on_host_gone(self, transport: asyncio.Transport) -> None:
         """Note the end of a connection, unless this link has cut it itself."""
         if transport is self._transport:
             self._transport = None
@@ -347,7 +347,7 @@ class _Client(asyncio.BufferedProtocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
-        if self._link.joined(transport):
+        if self._link.admit(transport):
             self._transport = transport
         else:
             transport.abort()
@@ -361,4 +361,4 @@ class _Client(asyncio.BufferedProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - asyncio's signature
         if self._transport is not None:
-            self._link.left(self._transport)
+            self._link.on_host_gone(self._transport)

@@ -73,7 +73,7 @@ def test_estop_of_all_without_id_is_one_estop(fleet: FleetProcesses) -> None:
     wait_for(lambda: not any(estops(fleet, car) for car in cars), "ended for all")
 
 
-def test_an_e_stop_of_one_car_is_its_own(fleet: FleetProcesses) -> None:
+def test_estop_of_one_car_does_not_stop_the_others(fleet: FleetProcesses) -> None:
     _, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     for car, link in (("red", red), ("blue", blue)):
         fleet.gateway(link, car=car)

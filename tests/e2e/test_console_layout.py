@@ -35,12 +35,12 @@ MIN_PAD_SHARE = 1 / 3
 
 
 @pytest.fixture(scope="module", autouse=True)
-def patient() -> None:
+def browser_timeout() -> None:
     expect.set_options(timeout=PATIENCE_S * 1000)
 
 
 @pytest.fixture
-def many(stage: ConsoleStage) -> Iterator[ConsoleStage]:
+def twenty_cars(stage: ConsoleStage) -> Iterator[ConsoleStage]:
     """Add cars of which nothing but their presence is known, up to MANY."""
     names = [f"car{number:02d}" for number in range(MANY - len(CARS))]
     tokens = [stage.fleet.bus.token(keys.car_token("fleet", name)) for name in names]
@@ -70,9 +70,9 @@ def boxes(tiles: Locator) -> dict[str, list[float]]:
     return {car: [box["x"], box["y"], box["width"], box["height"]] for car, box in tiles.evaluate_all(script)}
 
 
-@pytest.mark.parametrize("held", [PORTRAIT, LANDSCAPE], ids=["portrait", "landscape"])
-def test_report_never_covers_pad_or_stop_on_phone(many: ConsoleStage, held: dict[str, Any]) -> None:
-    page = many.driving_page("red", **held)
+@pytest.mark.parametrize("screen", [PORTRAIT, LANDSCAPE], ids=["portrait", "landscape"])
+def test_report_never_covers_pad_or_stop_on_phone(twenty_cars: ConsoleStage, screen: dict[str, Any]) -> None:
+    page = twenty_cars.driving_page("red", **screen)
     expect(page.locator("[data-live=red]")).to_contain_text(re.compile(r"Distance [\d.]+ m"))
     before = page.locator("[data-motion=forward]").bounding_box()
     page.locator("#stop").tap()
@@ -97,7 +97,7 @@ def test_report_never_covers_pad_or_stop_on_phone(many: ConsoleStage, held: dict
         page.locator("#estop").tap()
     page.evaluate("document.querySelector('main').scrollTop = 0")
     assert page.locator("[data-motion=forward]").bounding_box() == before, "it has not moved"
-    if held is LANDSCAPE:
+    if screen is LANDSCAPE:
         pad = page.locator(".pads").bounding_box()
         assert pad is not None
         assert pad["width"] * pad["height"] >= MIN_PAD_SHARE * 844 * 390
@@ -116,19 +116,19 @@ def test_a_report_is_one_line_until_it_is_unfolded(stage: ConsoleStage) -> None:
     expect(page.locator("[data-stop]")).to_have_count(len(CARS))
 
 
-@pytest.mark.parametrize("held", [LAPTOP, PORTRAIT], ids=["laptop", "phone"])
-def test_twenty_cars_fit_a_laptop_and_six_a_phone(many: ConsoleStage, held: dict[str, Any]) -> None:
-    page = many.page(**held)
+@pytest.mark.parametrize("screen", [LAPTOP, PORTRAIT], ids=["laptop", "phone"])
+def test_twenty_cars_fit_a_laptop_and_six_a_phone(twenty_cars: ConsoleStage, screen: dict[str, Any]) -> None:
+    page = twenty_cars.page(**screen)
     tiles = page.locator("[data-car]")
     expect(tiles).to_have_count(MANY)
-    fit = MANY if held is LAPTOP else 6
+    fit = MANY if screen is LAPTOP else 6
     assert is_in_reach(page, f".cell:nth-child(-n+{fit}) [data-car]")
     expect(page.locator("[data-summary]")).to_contain_text(f"{MANY} cars · 0 moving")
 
 
-@pytest.mark.parametrize("held", [LAPTOP, PORTRAIT], ids=["laptop", "phone"])
-def test_no_tile_moves_when_a_car_gets_into_trouble(stage: ConsoleStage, held: dict[str, Any]) -> None:
-    page = stage.page(**held)
+@pytest.mark.parametrize("screen", [LAPTOP, PORTRAIT], ids=["laptop", "phone"])
+def test_no_tile_moves_when_a_car_gets_into_trouble(stage: ConsoleStage, screen: dict[str, Any]) -> None:
+    page = stage.page(**screen)
     tiles = page.locator("[data-car]")
     expect(tiles).to_have_count(len(CARS))
     expect(page.locator("[data-trouble]")).to_have_count(0)
@@ -228,14 +228,14 @@ def test_each_page_is_two_presses_away_on_a_phone(stage: ConsoleStage) -> None:
     assert page.locator("nav a[aria-current]").all_inner_texts() == [shown[-1]]
 
 
-@pytest.mark.parametrize("held", [PORTRAIT, LANDSCAPE, TABLET, LAPTOP], ids=["phone", "across", "tablet", "laptop"])
-def test_layout_fits_screen_and_touch_targets_are_large(many: ConsoleStage, held: dict[str, Any]) -> None:
-    page = many.page(**held)
+@pytest.mark.parametrize("screen", [PORTRAIT, LANDSCAPE, TABLET, LAPTOP], ids=["phone", "across", "tablet", "laptop"])
+def test_layout_fits_screen_and_touch_targets_are_large(twenty_cars: ConsoleStage, screen: dict[str, Any]) -> None:
+    page = twenty_cars.page(**screen)
     controls = "main button, main select, main input:not([type=checkbox]), main summary, nav a, .stopbar button"
     small = "(all) => all.map((each) => [each.outerHTML.slice(0, 80), each.getBoundingClientRect().height])"
     page.locator("[data-car=red]").wait_for()
     for path in ("#/", "#/drive"):
-        page.goto(f"{many.console.address}/{path}")
+        page.goto(f"{twenty_cars.console.address}/{path}")
         if path == "#/drive":
             page.locator("input[name=select-red]").check()
             page.locator("[data-mode=manual]").wait_for()
@@ -245,7 +245,7 @@ def test_layout_fits_screen_and_touch_targets_are_large(many: ConsoleStage, held
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_white_and_a_black_car_are_seen(stage: ConsoleStage, scheme: str) -> None:
+def test_marks_of_white_and_black_cars_have_enough_contrast(stage: ConsoleStage, scheme: str) -> None:
     page = stage.page(**LAPTOP, color_scheme=scheme)
     tile = page.locator("[data-car=red]")
     for color in ("#ffffff", "#000000"):

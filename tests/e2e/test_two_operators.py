@@ -23,7 +23,7 @@ with Fleet(sender="bot") as fleet:
                 try:
                     car.drive("spin_left", {LONG_S})
                 except NotCarriedOut as error:
-                    if error.outcome.reason != "stale":  # the machine stood while it was on its way
+                    if error.outcome.reason != "stale":  # the machine was busy, so the command came too late
                         raise
     except LeaseLost as error:
         sys.exit("lost: " + str(error))
@@ -55,7 +55,7 @@ class Record:
                 if event.sender.startswith(sender) and event.verb == verb
             ]
 
-    def taken(self) -> list[str]:
+    def takeovers(self) -> list[str]:
         """Return the messages about takeovers."""
         with self._lock:
             return [log.message for log in self._logs if log.name.endswith("lease_taken")]
@@ -75,13 +75,13 @@ def operator(fleet: FleetProcesses, who: str, *arguments: str) -> GatewayProcess
     return fleet.start("-m", "fleet.cli", *arguments)
 
 
-def ended(process: GatewayProcess) -> tuple[int, str]:
+def wait_for_end(process: GatewayProcess) -> tuple[int, str]:
     """Wait for the end. Return the exit code and the output: stderr, or stdout after a success."""
     code = process.wait()
     return code, (process.stderr or "\n".join(process.lines())).strip()
 
 
-def listed(fleet: FleetProcesses) -> dict[str, Any]:
+def row_of_fleet_list(fleet: FleetProcesses) -> dict[str, Any]:
     """Return the car's row of `fleet list --json`."""
     process = operator(fleet, "eve", "list", "--json")
     assert process.wait() == 0, process.stderr
@@ -89,45 +89,45 @@ def listed(fleet: FleetProcesses) -> dict[str, Any]:
     return row
 
 
-def drives(fleet: FleetProcesses, who: str, car: str = "red") -> bool:
+def is_driver(fleet: FleetProcesses, who: str, car: str = "red") -> bool:
     """Return True if the gateway names this person as the owner of the motion."""
     motion = fleet.state("motion", car)
     return motion is not None and motion.owner.startswith(who)
 
 
-def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None:
+def test_command_line_names_driver_after_refusal_takeover_stop(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     record = Record(fleet)
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", LONG)
-    wait_for(lambda: drives(fleet, "ann@"), "ann drives")
+    wait_for(lambda: is_driver(fleet, "ann@"), "ann drives")
     table, refused = operator(fleet, "eve", "list"), operator(fleet, "bob", "drive", "red", "back")
-    row = listed(fleet)
+    row = row_of_fleet_list(fleet)
     assert row["driver"].startswith("ann@")
     assert row["driver"].endswith(f"-{ann.pid}")
     assert row["driver_kind"] == "person"
     assert table.wait() == 0
     assert "ann (person)" in table.lines()[1]
 
-    code, words = ended(refused)
+    code, words = wait_for_end(refused)
     assert code == 1
     assert words.startswith("red: refused: ")
     assert "ann (person) for another " in words
     assert words.endswith(" (--take). [leased]")
-    assert drives(fleet, "ann@"), "a refusal changed who drives"
+    assert is_driver(fleet, "ann@"), "a refusal changed who drives"
 
     bob = operator(fleet, "bob", "drive", "red", "back", "--for", LONG, "--take")
-    code, words = ended(ann)
+    code, words = wait_for_end(ann)
     assert code == 1
     assert words.startswith("red: ended early: ")
-    assert drives(fleet, "bob@")
+    assert is_driver(fleet, "bob@")
     assert driving(sim), "between the two it was driven on"
-    assert listed(fleet)["driver"].startswith("bob@")
+    assert row_of_fleet_list(fleet)["driver"].startswith("bob@")
 
     assert operator(fleet, "ann", "stop", "red").wait() == 0
-    code, words = ended(bob)
+    code, words = wait_for_end(bob)
     assert code == 1
     assert words.startswith("red: ended early: ")
     assert not driving(sim)
-    assert listed(fleet)["hold"].startswith("ann@")
+    assert row_of_fleet_list(fleet)["hold"].startswith("ann@")
 
     assert [(phase, reason) for phase, reason, _ in record.of("ann@")] == [
         ("asked", ""),
@@ -135,12 +135,12 @@ def test_on_the_command_line(fleet: FleetProcesses, sim: GatewayProcess) -> None
         ("sent", ""),
         ("superseded", "superseded"),
     ]
-    (taken,) = record.taken()
+    (taken,) = record.takeovers()
     assert "by bob (person) from ann (person)" in taken
 
 
 @pytest.fixture(scope="module")
-def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
+def three_cars(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses]:
     """Start three cars, one for each kind of command that moves a car."""
     fleet = FleetProcesses(free_endpoint(), tmp_path_factory.mktemp("several"))
     try:
@@ -157,24 +157,24 @@ def several(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProcesses
     ("car", "verb", "more"), [("red", "mode", ("tracking",)), ("green", "servo", ("front", "90")), ("blue", "fan", ())]
 )
 def test_moving_car_can_be_taken_over_with_take(
-    several: FleetProcesses, car: str, verb: str, more: tuple[str, ...]
+    three_cars: FleetProcesses, car: str, verb: str, more: tuple[str, ...]
 ) -> None:
-    several.ready(car)
-    ann = operator(several, "ann", "drive", car, "forward", "--for", LONG)
-    wait_for(lambda: drives(several, "ann@", car), "ann drives")
-    code, words = ended(operator(several, "bob", verb, car, *more))
+    three_cars.ready(car)
+    ann = operator(three_cars, "ann", "drive", car, "forward", "--for", LONG)
+    wait_for(lambda: is_driver(three_cars, "ann@", car), "ann drives")
+    code, words = wait_for_end(operator(three_cars, "bob", verb, car, *more))
     assert (code, "(--take)" in words) == (1, True), words
-    assert ended(operator(several, "bob", verb, car, *more, "--take"))[0] == 0
-    code, words = ended(ann)
+    assert wait_for_end(operator(three_cars, "bob", verb, car, *more, "--take"))[0] == 0
+    code, words = wait_for_end(ann)
     assert code == 1
     assert "by bob" in words
 
 
-def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> None:
+def test_a_person_takes_the_car_from_a_script_with_a_lease(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     record = Record(fleet)
     script = fleet.start("-c", SCRIPT)
-    wait_for(lambda: drives(fleet, "bot"), "the script drives")
-    assert (listed(fleet)["driver"], listed(fleet)["driver_kind"]) == ("bot", "script")
+    wait_for(lambda: is_driver(fleet, "bot"), "the script drives")
+    assert (row_of_fleet_list(fleet)["driver"], row_of_fleet_list(fleet)["driver_kind"]) == ("bot", "script")
 
     ann = operator(fleet, "ann", "drive", "red", "forward", "--for", "10s")
     assert script.wait() == 1
@@ -182,22 +182,22 @@ def test_a_person_and_a_script(fleet: FleetProcesses, sim: GatewayProcess) -> No
     assert script.stderr.startswith("lost: red "), script.stderr
     assert "by ann" in script.stderr
     wait_for(lambda: driving(sim), "ann's frame is obeyed")
-    assert drives(fleet, "ann@"), "the script that went stopped what ann drives"
+    assert is_driver(fleet, "ann@"), "the script that went stopped what ann drives"
     assert fleet.ask("drive", motion="back", sender="bot", kind="script")["reason"] == "leased"
-    assert drives(fleet, "ann@")
-    assert ended(ann)[0] == 0
+    assert is_driver(fleet, "ann@")
+    assert wait_for_end(ann)[0] == 0
     wait_for(lambda: not driving(sim), "it stands")
 
     assert all(reason in ("", "superseded", "leased", "stale") for _, reason, _ in record.of("bot"))
     assert "forward by ann" in next(words for phase, _, words in record.of("bot") if phase == "superseded")
-    (taken,) = record.taken()
+    (taken,) = record.takeovers()
     assert "by ann" in taken
     assert taken.endswith("from bot (script)")
 
 
 def test_killed_script_leaves_no_driving_car_and_no_lease(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     script = fleet.start("-c", SCRIPT)
-    wait_for(lambda: drives(fleet, "bot") and driving(sim), "the script drives")
+    wait_for(lambda: is_driver(fleet, "bot") and driving(sim), "the script drives")
     script.kill()
     wait_for(lambda: not driving(sim), "it stands", 8.0)
-    wait_for(lambda: listed(fleet)["driver"] is None, "nobody has it")
+    wait_for(lambda: row_of_fleet_list(fleet)["driver"] is None, "nobody has it")

@@ -460,10 +460,10 @@ def state_of(pair: Pair) -> str:
         return f"{kind[style]}mode contradicted"
     if mode is None or mode is Mode.MANUAL:
         pacing = control.driver.model.pacing
-        if control.driver.model.at_rest and control.driver.model.basis is Basis.SENT and pacing.blocked_at(now):
+        if control.driver.model.at_rest and control.driver.model.basis is Basis.SENT and pacing.is_blocked(now):
             return f"{kind[style]}at rest, a renewal blocks"  # the motors are off, so the ratio has no meaning
-        unread = "a frame may be unread" if not pacing.clear_at(now) else ""
-        what = unread or ("in a block of ours" if pacing.blocked_at(now) else "nothing unread")
+        unread = "a frame may be unread" if not pacing.is_clear(now) else ""
+        what = unread or ("in a block of ours" if pacing.is_blocked(now) else "nothing unread")
         return f"{kind[style]}{Mode.MANUAL}, {what}"
     if now < control.driver.model.pacing.block_until:
         return f"{kind[style]}opening {mode}"

@@ -76,12 +76,12 @@ def _find_self_conflicts(plan: Plan, rule: Rule) -> Iterator[tuple[Rule, str, bo
         own = effect.who in (THIS_CAR, ALL_CARS) or (rule.when.car is not None and effect.who == rule.when.car)
         if not own or mode is None or rule.until is not None or "mode.asked" not in rule.when.expression.names:
             continue
-        if _contradictory(rule.when.expression & _asked_for(mode)):
+        if _contradictory(rule.when.expression & _asked_condition(mode)):
             words = f"it undoes itself again and again. In mode {mode}, {rule.when.expression} is false."
             yield rule, f"{words} Add `until`.", True
 
 
-def _asked_for(mode: Mode) -> Expression:
+def _asked_condition(mode: Mode) -> Expression:
     """Return the condition that a car was commanded into this mode."""
     return Expression(Compare(Name("mode.asked", ValueKind.WORD), Op.EQ, Literal(str(mode))))
 

@@ -85,21 +85,23 @@ def find_faults(
     if cars is None and present is not None:
         listed = ", ".join(sorted(present)) or "no cars"
         warnings += [
-            _placed(plan, PlanFault(Severity.WARNING, f"car {car}", f"it is not connected now. Connected: {listed}."))
-            for car in sorted(_named(plan) - set(present))
+            _with_place(
+                plan, PlanFault(Severity.WARNING, f"car {car}", f"it is not connected now. Connected: {listed}.")
+            )
+            for car in sorted(_cars_named_in(plan) - set(present))
             if f"car {car}" not in reported
         ]
         warnings.sort(key=_position)
     return Faults(tuple(each for each in findings if each.severity is Severity.ERROR), tuple(warnings))
 
 
-def _named(plan: Plan) -> set[str]:
+def _cars_named_in(plan: Plan) -> set[str]:
     return set(plan.named) | {condition.car for condition in plan.conditions if condition.car is not None}
 
 
 def check(plan: Plan, fleet: Mapping[str, CarSnapshot] | None = None) -> tuple[PlanFault, ...]:
     """Return the faults of a plan by line. `fleet` has the cars in the fleet file, or is None if there is no file."""
-    found = dict.fromkeys(_placed(plan, fault) for fault in _Check(plan, fleet).findings())
+    found = dict.fromkeys(_with_place(plan, fault) for fault in _Check(plan, fleet).findings())
     return tuple(sorted(found, key=_position))
 
 
@@ -107,7 +109,7 @@ def _position(fault: PlanFault) -> tuple[int, int]:
     return fault.line, fault.column
 
 
-def _placed(plan: Plan, fault: PlanFault) -> PlanFault:
+def _with_place(plan: Plan, fault: PlanFault) -> PlanFault:
     line, column = plan.places.get(fault.part, (1, 1))
     return replace(fault, line=line, column=column)
 
@@ -115,7 +117,7 @@ def _placed(plan: Plan, fault: PlanFault) -> PlanFault:
 class _Check:
     def __init__(self, plan: Plan, fleet: Mapping[str, CarSnapshot] | None) -> None:
         self._plan = plan
-        self._named = _named(plan)
+        self._named = _cars_named_in(plan)
         self._known = fleet
         self._unknown = set() if fleet is None else self._named - set(fleet)
         """Cars of the plan that are not in the fleet file. They are reported once, and not for each part that names

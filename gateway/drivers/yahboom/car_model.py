@@ -238,7 +238,7 @@ class CarModel:
     def for_stop(self, now: float) -> stop_in_progress.StopContext:
         """Return the context for the choice of a stop."""
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
-        clear, blocked = self.pacing.clear_at(now), self.pacing.blocked_at(now)
+        clear, blocked = self.pacing.is_clear(now), self.pacing.is_blocked(now)
         return stop_in_progress.StopContext(
             self.profile,
             self.known,

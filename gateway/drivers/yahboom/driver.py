@@ -80,15 +80,15 @@ class YahboomDriver(Executor):
 
     def measured(self, event: Event) -> Mapping[str, Fields]:
         """Return the measured values of an event by topic."""
-        return measured(_own(event), self.model.profile, self.model.mode.confirmed)
+        return measured(_as_wire_event(event), self.model.profile, self.model.mode.confirmed)
 
     def verdict(self, event: Event) -> str:
         """Return the kind of an event's bytes."""
-        return verdict_of(_own(event))
+        return verdict_of(_as_wire_event(event))
 
     def on_event(self, event: Event, now: float) -> None:
         """Update the state with an event."""
-        self._monitor.on_event(_own(event), now)
+        self._monitor.on_event(_as_wire_event(event), now)
         self._decoder.use_head(self.model.profile.dialect.head)
 
     # ------------------------------------------------------------------ the link, and time
@@ -224,7 +224,7 @@ class YahboomDriver(Executor):
         return self.model.learned.opened_as
 
 
-def _own(event: Event) -> WireEvent:
+def _as_wire_event(event: Event) -> WireEvent:
     return cast("WireEvent", event)
 
 

@@ -126,7 +126,7 @@ class Pacing:
             return float("-inf")  # the car may range again at once
         return self._reported_at + min(AWAKE_S, max(0.0, self._interval_s - LINK_DELAY_S))
 
-    def named_at(self, frame: Frame) -> float:
+    def earliest_named_at(self, frame: Frame) -> float:
         """Return the earliest time for a named frame, which the car must not read together with the one before it."""
         return float("-inf") if isinstance(frame, General | Reset) else self._framed_at + NAMED_GAP_S
 
@@ -156,12 +156,12 @@ class Pacing:
         """Return the latest end of the last frame's block."""
         return self._read_by + self._block_s
 
-    def blocked_at(self, now: float) -> bool:
+    def is_blocked(self, now: float) -> bool:
         """Return True if the car is certainly acting on our last frame, and not still ranging before it reads it."""
         running = self._sure_s > FLIGHT_S and now < self._written_at + self._sure_s
-        return running and self._before_s == 0.0 and self.clear_at(now)
+        return running and self._before_s == 0.0 and self.is_clear(now)
 
-    def clear_at(self, now: float) -> bool:
+    def is_clear(self, now: float) -> bool:
         """Return True if the car will have read all our frames before the next one is sent."""
         return self._read_by <= max(now, self.ready_at(Gate.FLIGHT))
 
@@ -179,7 +179,7 @@ class Pacing:
         """Return the earliest time for the frame of a one-shot."""
         if self.profile.kind is Platform.RASPBERRY_PI and not isinstance(frame, General):
             return max(self.flight_until, self.buffer_until)  # if it is received with another one, the program dies
-        return max(self.flight_until, self.named_at(frame))
+        return max(self.flight_until, self.earliest_named_at(frame))
 
     def open_at(self, now: float, *, can_show: bool) -> float:
         """Return when a mode may be opened."""

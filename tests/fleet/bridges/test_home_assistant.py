@@ -130,7 +130,7 @@ def test_availability_left_by_killed_bridge_is_set_offline() -> None:
     }
 
 
-def test_a_broker_that_forgot_everything_gets_it_again() -> None:
+def test_everything_is_published_again_to_a_restarted_broker() -> None:
     plan = HomeAssistant("fleet")
     states = {"red": car()}
     first = by_topic(plan.news(states, 0.0))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from fleet.client.reading import Reading
-from fleet.commands.observe import CAR_COLUMNS, OPTIONAL_CAR_COLUMNS, row_of, shown
+from fleet.commands.observe import CAR_COLUMNS, OPTIONAL_CAR_COLUMNS, cell_text, row_of
 from fleet.commands.output import show_table
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -33,7 +33,7 @@ def row(**messages: Any) -> dict[str, Any]:
 )
 def test_an_unheard_car_is_shown_as_one(link: pb.Link, motors: str, unheard: bool, cell: str) -> None:
     told = row(link=link, safety=pb.Safety(motors=motors))
-    assert (told["unheard"], shown("link", told)) == (unheard, cell)
+    assert (told["unheard"], cell_text("link", told)) == (unheard, cell)
     assert told["last_rx_s"] == (round(link.last_rx_s, 3) if link.HasField("last_rx_s") else None)
 
 
@@ -41,9 +41,9 @@ def test_a_contradicted_platform_is_shown() -> None:
     words = "a voltage of 7.91 V, which no raspberry_pi car sends"
     told = row(health=pb.Health(platform="raspberry_pi", platform_contradictions=[words]))
     assert (told["platform"], told["platform_contradictions"]) == ("raspberry_pi", [words])
-    assert shown("platform", told) == "raspberry_pi (contradicted)"
-    assert shown("platform", row(health=pb.Health(platform="arduino"))) == "arduino"
-    assert shown("platform", row()) == "-", "an older gateway, or none that answers"
+    assert cell_text("platform", told) == "raspberry_pi (contradicted)"
+    assert cell_text("platform", row(health=pb.Health(platform="arduino"))) == "arduino"
+    assert cell_text("platform", row()) == "-", "an older gateway, or none that answers"
 
 
 @pytest.mark.parametrize(("columns", "left_out"), [("80", {"PLATFORM", "VERDICT"}), ("200", set())])
@@ -59,7 +59,7 @@ def test_the_table_of_cars_fits_a_terminal(
         health=pb.Health(platform="raspberry_pi"),
         battery=pb.Battery(voltage_v=7.4, level="ok"),
     )
-    show_table(CAR_COLUMNS, [{name: shown(name, told) for name in CAR_COLUMNS}], optional=OPTIONAL_CAR_COLUMNS)
+    show_table(CAR_COLUMNS, [{name: cell_text(name, told) for name in CAR_COLUMNS}], optional=OPTIONAL_CAR_COLUMNS)
     header, line = capsys.readouterr().out.splitlines()
     assert max(len(header), len(line)) <= int(columns)
     assert {name.upper() for name in CAR_COLUMNS} - set(header.split()) >= left_out
@@ -97,19 +97,19 @@ def test_row_shows_motors_with_basis_and_ready_or_waiting() -> None:
     row = row_of("red", states())
     assert (row["motors"], row["motors_basis"], row["ready"], row["shows_stops"]) == ("off", "sent", True, "no")
     assert row["claims"]["motors"]["age_s"] is not None
-    assert [shown(name, row) for name in ("ready", "motors", "shows stops")] == ["ready", "off (sent)", "no"]
+    assert [cell_text(name, row) for name in ("ready", "motors", "shows stops")] == ["ready", "off (sent)", "no"]
     waiting = row_of("red", states(waits_for="its first stop, for 1.2 s at most"))
-    assert (waiting["ready"], shown("ready", waiting)) == (False, "waits for its first stop, for 1.2 s at most")
+    assert (waiting["ready"], cell_text("ready", waiting)) == (False, "waits for its first stop, for 1.2 s at most")
 
     silent = states() | {"state/link": replace(states()["state/link"], value=pb.Link(state="stale"))}
     row = row_of("red", silent)
-    assert (row["ready"], row["why_not_ready"], shown("ready", row)) == (False, WHY_SILENT, WHY_SILENT)
+    assert (row["ready"], row["why_not_ready"], cell_text("ready", row)) == (False, WHY_SILENT, WHY_SILENT)
 
 
 def test_of_old_states_no_car_is_ready() -> None:
     old = {topic: replace(each, time=each.time - timedelta(seconds=60)) for topic, each in states().items()}
     row = row_of("red", old)
-    assert (row["ready"], shown("ready", row), shown("motors", row)) == (False, "-", "off (sent, stale)")
+    assert (row["ready"], cell_text("ready", row), cell_text("motors", row)) == (False, "-", "off (sent, stale)")
 
 
 def test_without_gateway_no_link_online_and_no_motors_off() -> None:

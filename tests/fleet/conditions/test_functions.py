@@ -54,7 +54,7 @@ def test_a_plan_reads_a_function_of_the_newest_readings() -> None:
         came(observer, at, range_m)
         held.append(observer.snapshot(()).holds(expression, "red", at))
     assert held == [None, True, True, False, False], "three readings back, and one of them measured nothing"
-    used = observer.snapshot(()).used(expression, "red", 3.0)
+    used = observer.snapshot(()).describe_readings(expression, "red", 3.0)
     assert used == ("red/sensor/range slope(range_m)=-0.1 (0.0 s old)",)
     observer.on_sleep(60.0)
     assert observer.snapshot(()).holds(expression, "red", 3.0) is None, "stale"

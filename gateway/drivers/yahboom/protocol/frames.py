@@ -106,31 +106,31 @@ def encode(frame: Frame, dialect: Dialect = STANDARD) -> bytes:
     """Return the bytes of a frame. Raises EncodeError for a value that the table does not allow."""
     match frame:
         case General():
-            return _general(frame, dialect)
+            return _encode_general(frame, dialect)
         case Reset():
             return b"#"
         case _:
-            return b"$%b,%b#" % (dialect.head.encode(), _named(frame))
+            return b"$%b,%b#" % (dialect.head.encode(), _encode_named(frame))
 
 
-def _named(frame: Ptz | ColorLed | ModeOpen | ModeClose | ArmSet) -> bytes:
+def _encode_named(frame: Ptz | ColorLed | ModeOpen | ModeClose | ArmSet) -> bytes:
     match frame:
         case Ptz(deg):
-            return b"PTZ%d" % _ranged("deg", deg, DEG_MAX)
+            return b"PTZ%d" % _check_range("deg", deg, DEG_MAX)
         case ColorLed(r, g, b):
-            rgb = (_ranged("r", r, COLOR_MAX), _ranged("g", g, COLOR_MAX), _ranged("b", b, COLOR_MAX))
+            rgb = (_check_range("r", r, COLOR_MAX), _check_range("g", g, COLOR_MAX), _check_range("b", b, COLOR_MAX))
             return b"CLR%d,CLG%d,CLB%d" % rgb
         case ModeOpen(mode):
-            digit = MODES[_member("mode", mode, Mode)].digit
+            digit = MODES[_check_member("mode", mode, Mode)].digit
             if not digit:
                 raise EncodeError("mode: 'manual' cannot be opened (MODE01); allowed are the other six, or close it")
             return b"MODE%d1" % digit
         case ModeClose(mode):
-            return b"MODE%d0" % MODES[_member("mode", mode, Mode)].digit
+            return b"MODE%d0" % MODES[_check_member("mode", mode, Mode)].digit
         case ArmSet(joints):
             if len(joints) != ARM_JOINTS:
                 raise EncodeError(f"joint_deg: {len(joints)} values, allowed are {ARM_JOINTS}, each 0..{DEG_MAX}")
-            degs = tuple(_ranged(f"joint_deg[{i}]", deg, DEG_MAX) for i, deg in enumerate(joints))
+            degs = tuple(_check_range(f"joint_deg[{i}]", deg, DEG_MAX) for i, deg in enumerate(joints))
             return b"ServoJ1%d,J2%d,J3%d,J4%d,J5%d,J6%d" % degs
 
 
@@ -155,11 +155,11 @@ def parse_sent(data: bytes, dialect: Dialect = STANDARD) -> Frame | None:
     return None
 
 
-def _general(frame: General, dialect: Dialect) -> bytes:
-    run, spin = _MOTION_DIGITS[_member("motion", frame.motion, Motion)]
-    speed = 0 if frame.speed is None else _SPEED_DIGITS[_member("speed", frame.speed, SpeedStep)]
-    servo, reset = (0, 0) if frame.servo is None else _SERVO_DIGITS[_member("servo", frame.servo, ServoAction)]
-    light = 0 if frame.light is None else _light_digit(_member("light", frame.light, Light), dialect)
+def _encode_general(frame: General, dialect: Dialect) -> bytes:
+    run, spin = _MOTION_DIGITS[_check_member("motion", frame.motion, Motion)]
+    speed = 0 if frame.speed is None else _SPEED_DIGITS[_check_member("speed", frame.speed, SpeedStep)]
+    servo, reset = (0, 0) if frame.servo is None else _SERVO_DIGITS[_check_member("servo", frame.servo, ServoAction)]
+    light = 0 if frame.light is None else _light_digit(_check_member("light", frame.light, Light), dialect)
     places = (run, spin, bool(frame.whistle), speed, servo, bool(frame.sing), light, bool(frame.fan), reset)
     return b"$%d,%d,%d,%d,%d,%d,%d,%d,%d#" % places
 
@@ -168,13 +168,13 @@ def _light_digit(light: Light, dialect: Dialect) -> int:
     return _LIGHT_DIGITS[_SWAPPED.get(light, light) if dialect.swaps_green_and_blue else light]
 
 
-def _ranged(field: str, value: int, top: int) -> int:
+def _check_range(field: str, value: int, top: int) -> int:
     if type(value) is not int or not 0 <= value <= top:
         raise EncodeError(f"{field}: {value!r}, allowed are whole numbers 0..{top}")
     return value
 
 
-def _member(field: str, value: _Word, kind: type[_Word]) -> _Word:
+def _check_member(field: str, value: _Word, kind: type[_Word]) -> _Word:
     if not isinstance(value, kind):
         raise EncodeError(f"{field}: {value!r}, allowed are {', '.join(kind)}")
     return value

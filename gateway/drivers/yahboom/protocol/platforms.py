@@ -259,7 +259,7 @@ class Profile:
             case ModeOpen(mode):
                 if mode in self.modes and mode is not Mode.MANUAL:
                     return None
-                return f"{self._these} do not know mode {mode}; {self._known(self.modes - {Mode.MANUAL})}"
+                return f"{self._these} do not know mode {mode}; {self._list_known(self.modes - {Mode.MANUAL})}"
             case ModeClose(mode):
                 if "mode" in self.capabilities or (self.kind is Platform.UNKNOWN and mode is Mode.MANUAL):
                     return None
@@ -287,7 +287,7 @@ class Profile:
         # An stm32 car obeys in every mode at once. Only a report of 48 ms delays it.
         return FRAME_S if self.kind is Platform.STM32 else MODES[mode].turn_s
 
-    def resolved(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
+    def modes_of_frame(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
         """Return the modes in which the car may have sent this frame.
 
         If the confirmed `mode` is among the candidates, return only that. If not, the frame may be a corrupted frame of
@@ -301,10 +301,10 @@ class Profile:
     def measured(self, event: Sensors, mode: Mode | None = None) -> frozenset[str]:
         """Return the fields of this frame that are measurements in every mode in which it may have been sent.
 
-        `mode` is the confirmed mode, or None (see `resolved`). A rejected field is no measurement. A range without an
-        echo is one.
+        `mode` is the confirmed mode, or None (see `modes_of_frame`). A rejected field is no measurement. A range
+        without an echo is one.
         """
-        common = _common_measurements(self.resolved(event, mode), candidate_modes(event))
+        common = _common_measurements(self.modes_of_frame(event, mode), candidate_modes(event))
         names = {name for name in common if getattr(event, ATTRIBUTES[name]) is not None}
         if self.constants and self._may_be_constant(event):
             names -= {name for name, value in self.constants if getattr(event, ATTRIBUTES[name]) == value}
@@ -341,7 +341,7 @@ class Profile:
             return None
         left, right = event.obstacle
         # In mode 6 HW is inverted: 0 = object seen (docs/reference/protocol.md#placeholders).
-        return (not left, not right) if self.resolved(event, mode) == (Mode.FOLLOWING,) else (left, right)
+        return (not left, not right) if self.modes_of_frame(event, mode) == (Mode.FOLLOWING,) else (left, right)
 
     def contradictions(self, event: Sensors) -> tuple[str, ...]:
         """Return the contradictions between this frame and the platform, in words. None found proves nothing."""
@@ -376,9 +376,9 @@ class Profile:
         if frame.sing:
             return "no car can sing (in the table: temporarily not supported)"
         if frame.servo and frame.servo not in self.servos:
-            return f"{self._these} do not know servo action {frame.servo}; {self._known(self.servos)}"
+            return f"{self._these} do not know servo action {frame.servo}; {self._list_known(self.servos)}"
         if frame.light and frame.light not in self.lights:
-            return f"{self._these} do not know light {frame.light}; {self._known(self.lights)}"
+            return f"{self._these} do not know light {frame.light}; {self._list_known(self.lights)}"
         return None
 
     def _unless(self, capability: str, what: str) -> str | None:
@@ -389,7 +389,7 @@ class Profile:
         return "cars of an unknown platform" if self.kind is Platform.UNKNOWN else f"{self.name} cars"
 
     @staticmethod
-    def _known(words: frozenset[Light] | frozenset[Mode] | frozenset[ServoAction]) -> str:
+    def _list_known(words: frozenset[Light] | frozenset[Mode] | frozenset[ServoAction]) -> str:
         return f"they know {', '.join(sorted(words))}" if words else "they know none"
 
 

@@ -183,7 +183,7 @@ class StopInProgress:
         """Return when the next step is due."""
         step = self.sequence.steps[self.index]
         due = (self.try_at if self.index == 0 else max(self.last_at, self.other_at)) + step.after_s
-        self.due = max(due, pacing.ready_at(step.gate), pacing.named_at(step.frame))
+        self.due = max(due, pacing.ready_at(step.gate), pacing.earliest_named_at(step.frame))
         return self.due
 
     @property

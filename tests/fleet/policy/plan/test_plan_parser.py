@@ -33,12 +33,12 @@ def test_fixed_mode_of_car_is_own_role() -> None:
     assert plan.version == parse(plan.text).version != parse(plan.text + "#").version
 
 
-def test_yaml_1_1_words_stay_words() -> None:
+def test_on_no_and_y_are_names_and_not_yaml_1_1_booleans() -> None:
     plan = parse("fixed: {on: {mode: manual}, no: {mode: tracking}, 'off': {mode: manual}, y: {mode: manual}}")
     assert list(plan.fixed) == ["on", "no", "off", "y"]
 
 
-def test_a_condition_is_told_as_it_was_meant() -> None:
+def test_text_of_a_condition_has_its_cars_and_its_time() -> None:
     plan = parse(
         "fixed: {red: {mode: tracking}}\n"
         "rules: [{when: {all_cars: not (light.left), for_s: 2}, then: {who: all_cars, mode: manual}}]"
@@ -52,7 +52,7 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("", "p:1:1: error: … empty"),
         ("{}", "p:1:1: error: … roles. … `roles: {"),
@@ -128,13 +128,13 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
         ),
     ],
 )
-def test_a_mistake_is_named(text: str, told: str) -> None:
+def test_each_mistake_has_place_and_reason(text: str, message: str) -> None:
     with pytest.raises(BadFile) as raised:
         parse(text, "p")
-    assert has_parts(str(raised.value), told)
+    assert has_parts(str(raised.value), message)
 
 
-def test_all_mistakes_are_told_at_once() -> None:
+def test_all_mistakes_are_reported_at_once() -> None:
     with pytest.raises(BadFile) as raised:
         parse(
             "roles:\n  a: {mode: tracking, needs: volts > 7}\n  b: {mode: manual, if_none: c}\n"

@@ -289,7 +289,7 @@ def test_announced_time_is_never_less_than_waited() -> None:
         for ago_s in (0.0, 0.05, 0.3, 1.0, 2.0, 9.0):
             pacing = Pacing(each.profile, Learned())
             pacing.on_written(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
-            situation = replace(each, clear=pacing.clear_at(100.0), blocked=False)
+            situation = replace(each, clear=pacing.is_clear(100.0), blocked=False)
             for recipe in (stop_in_progress.full(situation), stop_in_progress.soft(situation)):
                 worst_s = stop_in_progress.worst_s(recipe, situation, pacing, 100.0)
                 assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop_in_progress.WIRE_S
