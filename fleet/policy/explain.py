@@ -148,18 +148,18 @@ def explain_role(
     if role.needs is not None:
         old = describe_unmeasured(role.needs, [(known, role.mode)], ": the last value counts")
         changes.append(f"{role.needs_text} becomes false{old}")
-    changes += [f"{pinned[1]} ends"] if pinned is not None else _rules_for(car, known, role, plan, phase)
+    changes += [f"{pinned[1]} ends"] if pinned is not None else _rules_against(car, known, role, plan, phase)
     if any(each.roles is not None and name not in each.roles for each in plan.phases.values()):
         changes.append(f"phase {phase} ends")
     changes.append("a person stops or drives it")
     return _about_car(car, DecisionKind.ROLE, cause, why, held_role.used, changes, name, role.mode)
 
 
-def _rules_for(car: str, known: CarSnapshot, role: Role, plan: Plan, phase: str) -> list[str]:
+def _rules_against(car: str, known: CarSnapshot, role: Role, plan: Plan, phase: str) -> list[str]:
     """List the rules that could take the car out of this role."""
     rules = []
     for rule in plan.rules:
-        could = [effect for effect in rule.effects if _could(effect, rule, car, role, plan)]
+        could = [effect for effect in rule.effects if _could_take(effect, rule, car, role, plan)]
         if could and (rule.during is None or phase in rule.during):
             own = rule.when.car == car or all(effect.who == THIS_CAR for effect in could)
             unseen = describe_unmeasured(rule.when.expression, [(known, role.mode)]) if own else ""
@@ -167,7 +167,8 @@ def _rules_for(car: str, known: CarSnapshot, role: Role, plan: Plan, phase: str)
     return rules[:_MAX_REASONS]
 
 
-def _could(effect: Effect, rule: Rule, car: str, role: Role, plan: Plan) -> bool:
+def _could_take(effect: Effect, rule: Rule, car: str, role: Role, plan: Plan) -> bool:
+    """Return True if an effect of a rule could take the car out of this role."""
     if effect.role is not None:
         if effect.role == role.name or not plan.may(car, plan.roles[effect.role]):
             return False

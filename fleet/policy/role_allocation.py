@@ -157,11 +157,10 @@ def follow_needs(
             continue
         for car in cars:
             if plan.may(car, role):
-                same = role.needs_text, car
-                if same not in values:
-                    values[same] = snapshot.holds(role.needs, car, now, old=True)
-                so = values[same]
-                settled = settle(before.get((car, role.name)), so, now)
+                key = role.needs_text, car  # several roles may have the same needs
+                if key not in values:
+                    values[key] = snapshot.holds(role.needs, car, now, old=True)
+                settled = settle(before.get((car, role.name)), values[key], now)
                 if settled is not None:
                     result[car, role.name] = settled
     return result
@@ -177,24 +176,27 @@ def allocate(candidates: Candidates) -> RoleAllocation:
     }
     costs = _costs(candidates)
     places, stands_in = dict(counts), dict[str, str]()
+    # The fallback of a role may lack a car, too, and has a fallback of its own. So repeat until no places are added.
     while True:
-        open_ = {name: min(places[name], counts.get(name, 0)) for name in plan.roles if name in places}
-        open_ |= {f"{name}{_STAND_IN}": places[name] - count for name, count in open_.items() if places[name] > count}
-        roles = {car: place.removesuffix(_STAND_IN) for car, place in assign(costs, open_).items()}
-        more = dict(counts)
+        open_places = {name: min(places[name], counts.get(name, 0)) for name in plan.roles if name in places}
+        open_places |= {
+            f"{name}{_STAND_IN}": places[name] - count for name, count in open_places.items() if places[name] > count
+        }
+        roles = {car: place.removesuffix(_STAND_IN) for car, place in assign(costs, open_places).items()}
+        wanted = dict(counts)
         for name in _fallback_order(plan):
             role = plan.roles[name]
             # A role for any number of cars lacks a car only if it has none.
-            lacks = max(0, (1 if role.count is None else more.get(name, 0)) - list(roles.values()).count(name))
-            if role.if_none is not None and name in more and lacks:
-                more[role.if_none] = more.get(role.if_none, 0) + lacks
+            lacks = max(0, (1 if role.count is None else wanted.get(name, 0)) - list(roles.values()).count(name))
+            if role.if_none is not None and name in wanted and lacks:
+                wanted[role.if_none] = wanted.get(role.if_none, 0) + lacks
                 stands_in[role.if_none] = name
-        more = {name: max(count, places.get(name, 0)) for name, count in more.items()}
-        if more == places:
+        wanted = {name: max(count, places.get(name, 0)) for name, count in wanted.items()}
+        if wanted == places:
             return RoleAllocation(
                 roles, places, {name: of for name, of in stands_in.items() if places[name] > counts.get(name, 0)}
             )
-        places = more
+        places = wanted
 
 
 def _count_places(candidates: Candidates, role: Role, cars: int) -> int:
@@ -234,12 +236,11 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
     """Return the cost of each car in each role that it may have."""
     plan = candidates.plan
     cars = sorted({*candidates.free, *candidates.reserved})
-    slots = _stand_in_ranks(plan)
-    every = sorted({*(_rank(role) for role in plan.roles.values()), *slots.values()})
-    ranks = {rank: order for order, rank in enumerate(every)}
+    stand_in_ranks = _stand_in_ranks(plan)
+    all_ranks = sorted({*(_rank(role) for role in plan.roles.values()), *stand_in_ranks.values()})
     # One place of a higher rank is worth more than all places of lower ranks, and any place is worth more than
     # everything else.
-    worth = {rank: (len(cars) + 1) ** (order + 1) * _ROLE_LOSS_COST * 10 for rank, order in ranks.items()}
+    worth = {rank: (len(cars) + 1) ** (order + 1) * _ROLE_LOSS_COST * 10 for order, rank in enumerate(all_ranks)}
     result: dict[str, dict[str, int]] = {}
     for car in cars:
         row: dict[str, int] = {}
@@ -266,7 +267,7 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
             if role.cars is not None and car in role.cars:
                 cost += role.cars.index(car) * 10
             row[role.name] = cost
-            if role.name in slots:
-                row[f"{role.name}{_STAND_IN}"] = cost + worth[_rank(role)] - worth[slots[role.name]]
+            if role.name in stand_in_ranks:
+                row[f"{role.name}{_STAND_IN}"] = cost + worth[_rank(role)] - worth[stand_in_ranks[role.name]]
         result[car] = row
     return result

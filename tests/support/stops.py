@@ -194,7 +194,7 @@ def last_moment(mode: Mode) -> Load:
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(SetMode(mode))
         pair.until(lambda: pair.sent[-1][1].endswith(b"1#"), OPENS_S)
-        pair.run(pair.control.driver.model.pacing.block_from - pair.now - 0.2 + 0.25 * moments.random())
+        pair.run(pair.control.driver.model.pacing.earliest_block_end - pair.now - 0.2 + 0.25 * moments.random())
 
     return load
 

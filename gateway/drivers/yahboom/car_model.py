@@ -266,7 +266,7 @@ class CarModel:
     def is_awake(self, now: float) -> bool:
         """Return True if the car reads a frame at once, because no block, known or only possible, is running."""
         pacing = self.pacing
-        if now <= pacing.awake_until and now >= pacing.block_from - FLIGHT_S / 2:
+        if now <= pacing.awake_until and now >= pacing.earliest_block_end - FLIGHT_S / 2:
             return True
         if now < pacing.block_until - FLIGHT_S:
             return False

@@ -133,13 +133,13 @@ class Executor(Driver):
         if now < model.ready_at:
             return None
         held = queue.held
-        if held is not None and not held.pending.sent and self._is_new(held.pending):
+        if held is not None and not held.pending.sent and self._may_overtake(held.pending):
             self.stops.give_way(now)
             return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
         if (change := self._next_mode) is not None:
             return self._open_mode(change, now)
         pending = None if self._actions_wait(now) else queue.next_part(now)
-        if pending is not None and now >= model.pacing.act_at(pending.next_frame) and self._is_new(pending):
+        if pending is not None and now >= model.pacing.act_at(pending.next_frame) and self._may_overtake(pending):
             frame = model.believed.with_motion(pending.next_frame)
             return self._write(frame, FrameOrigin.COMMAND, pending, pending)
         if self.stops.running is not None:
@@ -154,7 +154,7 @@ class Executor(Driver):
         change = self.queue.mode_change
         # Queued actions go before the mode, because the car would ignore them in the mode.
         stands = self.model.at_rest or self._full_stop_runs
-        waits = change is None or (self.queue.has_undelayed and stands) or not self._is_new(change)
+        waits = change is None or (self.queue.has_undelayed and stands) or not self._may_overtake(change)
         return None if waits else change
 
     def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
@@ -193,7 +193,7 @@ class Executor(Driver):
         held, change = self.queue.held, self.queue.mode_change
         waiting = [self._next_mode] if self._actions_wait(now) else [change, self.queue.next_part(now)]
         waiting += [held.pending] if held is not None and not held.pending.sent else []
-        return any(pending is not None and self._is_new(pending) for pending in waiting)
+        return any(pending is not None and self._may_overtake(pending) for pending in waiting)
 
     def _actions_wait(self, now: float) -> bool:
         """Return True if actions on parts of the car wait, because a stream of them is in the way of something else."""
@@ -239,7 +239,7 @@ class Executor(Driver):
         is_short = self.queue.mode_change is None or self.model.evidence.is_awaited
         return now >= running.goes_first_at or (may_show and is_short)
 
-    def _is_new(self, pending: Pending) -> bool:
+    def _may_overtake(self, pending: Pending) -> bool:
         """Return True if a command may go before the rest of the running stop: it is newer, or waits for that stop."""
         running = self.stops.running
         if running is None or not self._full_stop_runs:
@@ -248,8 +248,9 @@ class Executor(Driver):
         # newer mode may go before the repeats of a stop, the commands for which it waits may too.
         change = self.queue.mode_change
         newer = change if change is not None and change.received_at >= running.began_at else None
-        before = any(mode is not None and pending.received_at <= mode.received_at for mode in (running.before, newer))
-        return pending.received_at >= running.began_at or before
+        modes = (running.mode_command, newer)
+        waits = any(mode is not None and pending.received_at <= mode.received_at for mode in modes)
+        return pending.received_at >= running.began_at or waits
 
     def _repeats(self, at: float) -> bool:
         """Return True if the motion is to be repeated at this time: it has changed, and its drive does not end soon."""
@@ -267,12 +268,12 @@ class Executor(Driver):
         return self._write(renewal.next_frame(now), FrameOrigin.REPEAT, None, None)
 
     def _begin_stop(
-        self, sequence: StopSequence, why: FrameOrigin, now: float, before: Pending | None = None
+        self, sequence: StopSequence, why: FrameOrigin, now: float, mode_command: Pending | None = None
     ) -> OutgoingFrame | None:
-        """Begin a stop, which may be for a command (`before`). Return its first frame if that may be written now."""
+        """Begin a stop, which may be for a mode command. Return its first frame if that may be written now."""
         self.stops.begin(sequence, why, now)
         assert self.stops.running is not None
-        self.stops.running.before = before
+        self.stops.running.mode_command = mode_command
         self.stops.running.repeats = why is FrameOrigin.REPEAT
         return self._next_step(self.stops.running, now)
 
@@ -457,12 +458,12 @@ class Executor(Driver):
         times.extend(
             max(each.due_at, model.pacing.act_at(each.next_frame), model.left_until, free_at)
             for each in (queue.turns if self._next_mode is None and not actions_wait else ())
-            if self._is_new(each)
+            if self._may_overtake(each)
         )
-        if queue.held is not None and not queue.held.pending.sent and self._is_new(queue.held.pending):
+        if queue.held is not None and not queue.held.pending.sent and self._may_overtake(queue.held.pending):
             times.append(max(model.ready_at, free_at))
         change = self._next_mode if actions_wait else queue.mode_change
-        if change is not None and self._is_new(change):
+        if change is not None and self._may_overtake(change):
             opens = model.rest_is_sure or self._full_stop_runs
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))

@@ -72,23 +72,24 @@ class Pacing:
 
     def reset(self) -> None:
         """Forget everything, because the link is new."""
-        self._written_at = self._framed_at = float("-inf")
+        self._written_at = float("-inf")
+        self._framed_at = float("-inf")  # the same, of the last frame that is not a lone `#`
         self._block_s = 0.0
-        self._sure_s = 0.0
-        self._before_s = 0.0
-        self._read_by = float("-inf")
+        self._sure_block_s = 0.0  # 0 if the block is only possible
+        self._earlier_block_s = 0.0  # the longest block of the frames that may have been unread at the last write
+        self._read_by = float("-inf")  # the latest time at which the car has read all frames
         self._reported_at = float("-inf")
 
     def on_written(self, frame: Frame, now: float) -> None:
         """Record a written frame."""
         awake_at = max(now, self.block_until) if now <= self.awake_until else float("inf")
-        self._before_s = max(self._before_s, self._block_s) if now < self._read_by else 0.0
+        self._earlier_block_s = max(self._earlier_block_s, self._block_s) if now < self._read_by else 0.0
         self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_INTERVAL_S, self.block_until))
         self._written_at = now
         if not isinstance(frame, Reset):
             self._framed_at = now
         self._block_s = self.longest_block_s(frame)
-        self._sure_s = self._block_s if self._surely_blocks(frame) else 0.0
+        self._sure_block_s = self._block_s if self._surely_blocks(frame) else 0.0
 
     def longest_block_s(self, frame: Frame) -> float:
         """Return the maximum block of a frame, as expected and as this car has shown."""
@@ -109,7 +110,7 @@ class Pacing:
         """Record a report of mode 0, after which the car reads the waiting frames."""
         self._reported_at = at
         if at >= self._written_at + FLIGHT_S:  # an earlier report was under way when the frame was written
-            self._read_by = min(self._read_by, at + self._before_s)
+            self._read_by = min(self._read_by, at + self._earlier_block_s)
 
     @property
     def _interval_s(self) -> float:
@@ -147,7 +148,7 @@ class Pacing:
         return max(self._read_by, min(self.flight_until, self._written_at + REPEAT_INTERVAL_S))
 
     @property
-    def block_from(self) -> float:
+    def earliest_block_end(self) -> float:
         """Return the earliest end of the last frame's block."""
         return self._written_at + self._block_s
 
@@ -158,8 +159,8 @@ class Pacing:
 
     def is_blocked(self, now: float) -> bool:
         """Return True if the car is certainly acting on our last frame, and not still ranging before it reads it."""
-        running = self._sure_s > FLIGHT_S and now < self._written_at + self._sure_s
-        return running and self._before_s == 0.0 and self.is_clear(now)
+        running = self._sure_block_s > FLIGHT_S and now < self._written_at + self._sure_block_s
+        return running and self._earlier_block_s == 0.0 and self.is_clear(now)
 
     def is_clear(self, now: float) -> bool:
         """Return True if the car will have read all our frames before the next one is sent."""
@@ -171,7 +172,9 @@ class Pacing:
             case Gate.NOTHING:
                 return float("-inf")
             case Gate.FLIGHT:
-                return self._written_at + max(FLIGHT_S, self._sure_s)  # a block that is only possible does not count
+                return self._written_at + max(
+                    FLIGHT_S, self._sure_block_s
+                )  # a block that is only possible does not count
             case Gate.ALONE:
                 return self.buffer_until
 

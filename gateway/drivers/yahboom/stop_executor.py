@@ -111,7 +111,7 @@ class StopExecutor:
             commands,
             worst_at=now + worst_s,
             timeout_s=timeout_s,
-            reported_s=stop_in_progress.reported_s(model.profile, model.learned),
+            report_wait_s=stop_in_progress.report_wait_s(model.profile, model.learned),
             case=self._case(sequence),
         )
         model.evidence.begin_stop()
@@ -320,10 +320,10 @@ class StopExecutor:
             case _:
                 pass
         if finding is Finding.UNJUDGED:  # leave the next interval undisturbed, so that the rhythm can be learned
-            running.reported_s = stop_in_progress.reported_s(self.model.profile, self.model.learned, slowest=True)
+            running.report_wait_s = stop_in_progress.report_wait_s(self.model.profile, self.model.learned, slowest=True)
             if self.model.learned.echo.is_known:  # the rhythm was known, but it is another one now
                 next_s = at - running.last_at + stop_in_progress.SLOWEST_S + stop_in_progress.REPORT_MARGIN_S
-                running.reported_s = max(running.reported_s, next_s)
+                running.report_wait_s = max(running.report_wait_s, next_s)
         if self.running is running and running.frames_sent:
             self._await(running, now)
         # A probe counts only on a car that is awake, so send it directly after a report. If it cannot be sent now, wait

@@ -119,15 +119,15 @@ class Rhythm:
             self._others.clear()
             return False
         self._others.append(interval_s)
-        first = len(self.intervals) < 2  # the first interval is not confirmed by another one yet
-        needed = 2 if first else CHANGED_INTERVALS
+        is_unconfirmed = len(self.intervals) < 2  # a single interval may have been wrong
+        needed = 2 if is_unconfirmed else CHANGED_INTERVALS
         latest = list(self._others)[-needed:]
         if len(latest) < needed or max(latest) - min(latest) > SAME_S:
             return False
         self.intervals.clear()
         self.restore(latest)
         self._others.clear()
-        return not first
+        return not is_unconfirmed
 
     def restore(self, intervals: Iterable[float]) -> None:
         """Add intervals that belong to this rhythm."""
@@ -162,8 +162,11 @@ class Learned:
     rejected: dict[str, int] = field(default_factory=dict)
     """How often the value of a field was out of its range, by the word of the field."""
     _delays: dict[Blocking, deque[float]] = field(default_factory=dict)
+    """The last consecutive delays that may be the block of a kind of frame."""
     _blocks: dict[Blocking, float] = field(default_factory=dict)
+    """The block of each kind of frame, once its delays have agreed."""
     _unreacted: int = 0
+    """Number of blocking frames without a reaction since the last reaction."""
     _reacted: int = 0
     """Number of consecutive reactions since the finding that the car cannot show a stop."""
 

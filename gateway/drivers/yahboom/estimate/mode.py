@@ -52,9 +52,9 @@ class ModeEstimator:
     candidates: tuple[Mode, ...] = ()
     """Candidate modes. Empty if the car should report in every mode but is silent."""
     _asked_at: float = field(default=float("-inf"))
-    _settled_at: float = field(default=float("-inf"))
-    """When a car that obeys is in the commanded mode at the latest."""
-    _obeys_by: float = field(default=float("-inf"))
+    _in_mode_by: float = field(default=float("-inf"))
+    """The latest time at which a car that obeys is in the commanded mode."""
+    _in_same_mode_by: float = field(default=float("-inf"))
     """The same time for a car that was in that mode already when the last frame was written."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
@@ -84,10 +84,10 @@ class ModeEstimator:
         """Record a written frame that brings the car into `mode` and blocks it for `block_s`."""
         # The car obeys after the block of the previous frame and one turn of the previous mode. If that mode is
         # unknown, assume the slowest one.
-        left = self.asked if self.verdict is not Verdict.CONTRADICTED else None
-        turn_s = self.profile.mode_turn_s(left or Mode.OBSTACLE_AVOIDANCE)
-        self._settled_at = max(self._settled_at, now + turn_s) + block_s
-        self._obeys_by = now + self.profile.mode_turn_s(mode) + block_s
+        previous = self.asked if self.verdict is not Verdict.CONTRADICTED else None
+        turn_s = self.profile.mode_turn_s(previous or Mode.OBSTACLE_AVOIDANCE)
+        self._in_mode_by = max(self._in_mode_by, now + turn_s) + block_s
+        self._in_same_mode_by = now + self.profile.mode_turn_s(mode) + block_s
         if mode is self.asked is Mode.MANUAL and self.verdict is Verdict.CONFIRMED:
             return
         if mode is not self.asked or self.verdict is not Verdict.ASSUMED:
@@ -133,7 +133,7 @@ class ModeEstimator:
             if len(candidates) > 1:
                 return
             self._matches += 1
-            self._settled_at = min(self._settled_at, self._obeys_by)
+            self._in_mode_by = min(self._in_mode_by, self._in_same_mode_by)
             if at >= self._asked_at and (
                 self._matches >= CONTRADICTING_FRAMES or at > self._other_at + CORRUPTED_MATCH_S
             ):
@@ -141,7 +141,7 @@ class ModeEstimator:
             return
         self._matches = 0
         self._other_at = at
-        if at < self._settled_at:
+        if at < self._in_mode_by:
             return  # the previous mode may still have sent it
         self._mismatches += 1
         if self._mismatches >= CONTRADICTING_FRAMES:
@@ -248,7 +248,7 @@ class ModeEstimator:
                 self._set_candidates(tuple(mode for mode in Mode if mode in self.profile.possible_modes))
                 self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, as expected while its fan runs", now)
             return
-        if now < self._settled_at:
+        if now < self._in_mode_by:
             return
         if self.unheard_s(now) > self.manual_silence_s:
             self._mismatches = 0
@@ -259,7 +259,7 @@ class ModeEstimator:
             self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, {why}", now)
 
     def _silence_s(self, heard_at: float, now: float) -> float:
-        since = max(heard_at, self._settled_at, self._excused_at)
+        since = max(heard_at, self._in_mode_by, self._excused_at)
         # Do not count older blocks: the car had obeyed those frames before it began this reading, whose ranging took
         # 1.0 s at most.
         return now - since - sum(block_s for at, block_s in self._blocks if at > since - REPEAT_INTERVAL_S)

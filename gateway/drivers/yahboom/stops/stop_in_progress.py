@@ -62,7 +62,7 @@ def evidence_s(profile: Profile, learned: Learned) -> float:
     return min(max(EVIDENCE_TIMEOUT_S, intervals_s), MAX_EVIDENCE_TIMEOUT_S)
 
 
-def reported_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
+def report_wait_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
     """Return the time after the last frame of a try within which a car that has obeyed it reports, s.
 
     With `slowest`, its rhythm is not known, so assume the slowest car.
@@ -139,8 +139,8 @@ class StopInProgress:
     """The latest time at which the motors are off, if all steps are in time and all frames arrive."""
     timeout_s: float = EVIDENCE_TIMEOUT_S
     """Timeout for the evidence, from the arrival of each command."""
-    reported_s: float = 0.0
-    """Minimum wait for a report after the last frame of a try."""
+    report_wait_s: float = 0.0
+    """Minimum wait for a report after the last frame of a try, by the function of this name."""
     due: float = float("inf")
     """When the next step is due, by the last call of `due_at`."""
     report_at: float = float("-inf")
@@ -154,7 +154,7 @@ class StopInProgress:
     """True if all frames of the first try are written, or a report has arrived after its `MODE00`."""
     overdue: bool = False
     """True if the car did not show the stop in time. The gateway continues to send it."""
-    before: Pending | None = None
+    mode_command: Pending | None = None
     """The mode command for which this stop is sent first."""
     repeats: bool = False
     """True if it repeats a stop whose first frames are written already. Then a command may replace it at once."""
@@ -197,7 +197,7 @@ class StopInProgress:
         after = self.closed_at if self.closed_at > float("-inf") else self.last_at
         # The frame of another command may delay the report. But a stream of them must not delay the next try for ever.
         last_at = max(self.last_at, min(self.other_at, self.last_at + HELD_UP_S))
-        return max(last_at + self.reported_s, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
+        return max(last_at + self.report_wait_s, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
 
     @property
     def has_stream(self) -> bool:
@@ -310,17 +310,17 @@ def soft(context: StopContext) -> StopSequence:
 
 def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: float) -> float:
     """Return the longest time until the motors are off for good, for a sequence that begins now."""
-    # The sum of the waits before a frame, the rest of the running block and the wire
-    # (docs/reference/protocol.md#stops).
-    # If an unread frame of ours may spoil the first frames, add the wait until a frame is alone in the buffer.
+    # Add the waits before a frame, the rest of the running block, and the time on the wire
+    # (docs/reference/protocol.md#stops). If an unread frame of ours may spoil the first frames, also add the wait until
+    # a frame is alone in the buffer.
     flight_s = max(pacing.ready_at(Gate.FLIGHT) - now, 0.0)
     block_s = max(pacing.block_until - now, 0.0)
     ranging_s = FRAME_S if context.blocked else context.profile.mode_turn_s(Mode.MANUAL)
     lost_s = 0.0 if context.clear else REPEAT_INTERVAL_S
     if sequence in (sequences.FULL, sequences.FULL_MODE):
         alone_s = max(pacing.buffer_until - now, 0.0)
-        if not context.manual and now + alone_s + IN_TIME_S < pacing.block_from:
-            return block_s + WIRE_S  # read as the opening ends, before the first turn
+        if not context.manual and now + alone_s + IN_TIME_S < pacing.earliest_block_end:
+            return block_s + WIRE_S  # the car reads it as the opening ends, before the first turn of the mode
         if not context.manual:
             return max(alone_s, block_s) + context.turn_s + WIRE_S
         return max(alone_s + ranging_s, block_s + FRAME_S) + WIRE_S
@@ -333,10 +333,10 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
         # it.
         return RECOVERY_SILENCE_S + _AVOIDING_S + WIRE_S
     if sequence is sequences.GENERAL and not context.known and context.profile.kind is not Platform.RASPBERRY_PI:
-        lost_s = REPEAT_INTERVAL_S  # behind half a frame the first two are lost
+        lost_s = REPEAT_INTERVAL_S  # the first two frames are lost if the car has half a frame in its buffer
         return flight_s + FRAME_S + lost_s + ranging_s + WIRE_S
-    one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.clear and context.known)
-    twice_s = 0.0 if one else FRAME_S  # the car may read only the second
+    begins_with_one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.clear and context.known)
+    second_s = 0.0 if begins_with_one else FRAME_S  # of two frames, the car may read only the second
     if context.clear:
-        return max(flight_s + twice_s + ranging_s, block_s + FRAME_S) + WIRE_S
-    return max(flight_s + twice_s + lost_s, block_s) + ranging_s + WIRE_S
+        return max(flight_s + second_s + ranging_s, block_s + FRAME_S) + WIRE_S
+    return max(flight_s + second_s + lost_s, block_s) + ranging_s + WIRE_S
