@@ -22,7 +22,7 @@ from fleet.client.wait import NotInTime
 from fleet.commands.fleets import open_client, open_observer
 from fleet.commands.group import say
 from fleet.commands.options import bus_options, json_option, with_client
-from fleet.commands.output import json_text, line, show_table
+from fleet.commands.output import json_text, reading_line, show_table
 from fleet.commands.params import (
     Duration,
     Number,
@@ -269,7 +269,7 @@ def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: 
         return
     width = max(len(reading.key) for reading in readings)
     for reading in readings:
-        click.echo(json_text(reading) if as_json else line(reading, width, past=past))
+        click.echo(json_text(reading) if as_json else reading_line(reading, width, past=past))
 
 
 def _print_shortfalls(lines: Sequence[str]) -> None:
@@ -306,7 +306,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
         reported = shown = 0
         with client.watch(keyexpr, when=when) as readings:
             for reading in readings:
-                click.echo(json_text(reading) if as_json else line(reading))
+                click.echo(json_text(reading) if as_json else reading_line(reading))
                 if readings.dropped > reported:
                     reported = readings.dropped
                     click.echo(
@@ -463,4 +463,4 @@ def wait(
             reading = client.wait(keyexpr, condition, timeout_s=timeout_s, for_s=for_s or 0.0)
         except NotInTime as late:
             raise click.ClickException(str(late)) from None
-    click.echo(json_text(reading) if as_json else line(reading))
+    click.echo(json_text(reading) if as_json else reading_line(reading))

@@ -41,7 +41,7 @@ def json_text(reading: Reading) -> str:
     return json.dumps(whole)
 
 
-def line(reading: Reading, width: int = 0, *, past: bool = False) -> str:
+def reading_line(reading: Reading, width: int = 0, *, past: bool = False) -> str:
     """Return a line: key (padded to `width`), fields with units, age. With `past`, leave out the staleness."""
     topic = topics.of_key(reading.key)
     units = topic.units if topic is not None else {}

@@ -85,9 +85,15 @@ def follow_rules(
 
 
 def _follow_rule(rule: Rule, snapshot: FleetSnapshot, cars: CarSets, before: RuleState, now: float) -> RuleState:
-    when = _follow(rule.when, snapshot, cars, before.when, now)
+    """Return the new state of one rule.
+
+    Without `until`, the rule is in force while its condition is true. With it, the rule stays in force until that is
+    true, while the car that triggered it is present. If that car is gone, a car for which the condition is true takes
+    its place, or else the rule ends.
+    """
+    when = _debounce_by_car(rule.when, snapshot, cars, before.when, now)
     true_for = [car for car, debounced in when.items() if debounced.on]
-    until = _NO_CARS if rule.until is None else _follow(rule.until, snapshot, cars, before.until, now)
+    until = _NO_CARS if rule.until is None else _debounce_by_car(rule.until, snapshot, cars, before.until, now)
     ended = any(debounced.on for debounced in until.values())
     trigger = (
         before.trigger
@@ -108,9 +114,10 @@ def _follow_rule(rule: Rule, snapshot: FleetSnapshot, cars: CarSets, before: Rul
     return RuleState(on=True, when=when, until=until, trigger=trigger, since=now, used=used)
 
 
-def _follow(
+def _debounce_by_car(
     condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, before: Mapping[str, Debounced], now: float
 ) -> Mapping[str, Debounced]:
+    """Return the debounced condition for each car, or under the name _ALL_CARS if it is about all cars."""
     if condition.of is Quantifier.ALL:
         value = _all_of(
             [snapshot.holds(condition.expression, car, now) for car in _watched_cars(condition, cars, before)]
@@ -152,8 +159,8 @@ def _all_of(each: list[bool | None]) -> bool | None:
 def _readings_used(
     condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, trigger: str | None, now: float
 ) -> tuple[str, ...]:
-    of = [trigger] if trigger is not None else _watched_cars(condition, cars, _NO_CARS)
-    return tuple(reading for car in of for reading in snapshot.describe_readings(condition.expression, car, now))
+    read = [trigger] if trigger is not None else _watched_cars(condition, cars, _NO_CARS)
+    return tuple(reading for car in read for reading in snapshot.describe_readings(condition.expression, car, now))
 
 
 def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: Mapping[str, str]) -> Iterator[str]:
@@ -210,12 +217,12 @@ def follow_phase(
 def _follow_phase_end(
     phase: PlanPhase, snapshot: FleetSnapshot, cars: CarSets, before: PhaseState, lasted_s: float, now: float
 ) -> PhaseState:
-    until = _NO_CARS if phase.until is None else _follow(phase.until, snapshot, cars, before.until, now)
+    until = _NO_CARS if phase.until is None else _debounce_by_car(phase.until, snapshot, cars, before.until, now)
     true_for = [car for car, debounced in until.items() if debounced.on]
     if phase.until is not None and phase.next is not None and true_for and lasted_s >= HYSTERESIS_S:
         used = _readings_used(phase.until, snapshot, cars, true_for[0] or None, now)
         return PhaseState(phase.next, now, why=f"{phase.name} ends with {phase.until.text}", used=used)
-    timed_s = lasted_s - before.waited_s
-    if phase.timeout_s is not None and phase.on_timeout is not None and timed_s >= max(phase.timeout_s, HYSTERESIS_S):
+    settled_s = lasted_s - before.waited_s
+    if phase.timeout_s is not None and phase.on_timeout is not None and settled_s >= max(phase.timeout_s, HYSTERESIS_S):
         return PhaseState(phase.on_timeout, now, why=f"{phase.name} lasts at most {phase.timeout_s:g} s")
     return replace(before, until=until)

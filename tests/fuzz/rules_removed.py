@@ -23,7 +23,7 @@ def _time_decides(patch: Patch) -> None:
         if now >= running.obeys_by:
             self._finish(running, Basis.SHOWN, "time", now)
 
-    patch(StopExecutor, "_await", await_time)
+    patch(StopExecutor, "_await_evidence", await_time)
 
 
 def _no_second_try(patch: Patch) -> None:

@@ -180,12 +180,12 @@ class StopExecutor:
     def is_step_due(self, running: StopInProgress, now: float) -> bool:
         """Return True if the next frame of the stop is due. After the last frame, check for evidence instead."""
         if running.frames_sent:
-            self._await(running, now)
+            self._await_evidence(running, now)
             if self.running is not running or running.frames_sent:
                 return False
         return now >= running.due_at(self.model.pacing)
 
-    def _await(self, running: StopInProgress, now: float) -> None:
+    def _await_evidence(self, running: StopInProgress, now: float) -> None:
         """End a stop that the car cannot show. Send the stop again if the car could show it, but did not in time."""
         case = self._ends_as_sent(running, now)
         if case is cases.SOFT and self.model.is_deaf:
@@ -248,7 +248,7 @@ class StopExecutor:
             return  # the silence that shows the stop takes 2 s at most
         car = self.model.name
         is_late = any(now >= pending.received_at + running.timeout_s for pending in running.commands)
-        if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._is_new(running):
+        if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._never_reacted(running):
             self._finish_unknown(running, now)
             return
         goes_on = f"The gateway keeps stopping it.{self.model.silent_program}"
@@ -273,7 +273,7 @@ class StopExecutor:
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
 
-    def _is_new(self, running: StopInProgress) -> bool:
+    def _never_reacted(self, running: StopInProgress) -> bool:
         """Return True if the car has reported in mode 0 since the stop, and was never seen to react to a frame."""
         is_unknown = self.model.learned.shows is Shows.UNKNOWN
         return is_unknown and running.report_at > running.began_at and self.model.is_heard
@@ -325,7 +325,7 @@ class StopExecutor:
                 next_s = at - running.last_at + stop_in_progress.SLOWEST_S + stop_in_progress.REPORT_MARGIN_S
                 running.report_wait_s = max(running.report_wait_s, next_s)
         if self.running is running and running.frames_sent:
-            self._await(running, now)
+            self._await_evidence(running, now)
         # A probe counts only on a car that is awake, so send it directly after a report. If it cannot be sent now, wait
         # for the next report.
         is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)

@@ -37,14 +37,15 @@ class _PlatformEvidence:
     """Debounces one observation over several frames."""
 
     holds: bool = False
-    _run: int = 0
+    _contrary: int = 0
+    """Number of consecutive frames that show the opposite of `holds`."""
 
     def update(self, *, shown: bool) -> bool:
         """Count one frame. Return True if the observation holds from now on."""
-        self._run = self._run + 1 if shown is not self.holds else 0
-        if self._run < EVIDENCE_FRAMES:
+        self._contrary = self._contrary + 1 if shown is not self.holds else 0
+        if self._contrary < EVIDENCE_FRAMES:
             return False
-        self._run = 0
+        self._contrary = 0
         self.holds = shown
         return shown
 
@@ -62,15 +63,17 @@ class PlatformDetector:
     """With `auto`: the profile with which a mode was opened that may still be open. Used until readings arrive."""
     profile: Profile = field(init=False)
     """The profile in force: the configured one, or with `auto` the detected one."""
-    _against: dict[str, _PlatformEvidence] = field(default_factory=dict)
+    _found_contradictions: dict[str, _PlatformEvidence] = field(default_factory=dict)
+    """Contradictions of the profile, in words, that hold or that some frames have shown."""
     _with_modes: str = ""
     _raspberry_pi: str = ""
     """Evidence for a car with modes, and for a Raspberry Pi. If there is evidence for both, the platform is unknown."""
-    _alone: int = 0
+    _one_kind_readings: int = 0
     """Number of consecutive readings that only one of the two kinds sends."""
-    _alone_has_modes: bool = False
+    _one_kind_has_modes: bool = False
     _options: frozenset[str] = frozenset()
-    _seen: dict[str, _PlatformEvidence] = field(
+    """With `auto`: the options that were detected."""
+    _observations: dict[str, _PlatformEvidence] = field(
         default_factory=lambda: {
             word: _PlatformEvidence()
             for word in (_MODE_READINGS, _MEASURED_READINGS, _CONSTANT_READINGS, _WIDE_READINGS)
@@ -78,7 +81,8 @@ class PlatformDetector:
     )
     _is_wide: bool = False
     """True if the grayscale readings are those of an stm32 car."""
-    _frames: dict[str, int] = field(default_factory=dict)
+    _signs: dict[str, int] = field(default_factory=dict)
+    """Number of frames that show an option, by option."""
     _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
     _extra_options: set[str] = field(default_factory=set)
     """Contradictions that only show an option which is not configured."""
@@ -87,9 +91,9 @@ class PlatformDetector:
     """True if the option `no_readings` of the profile comes from the silence of this link."""
     _is_heard: bool = False
     """True if readings have contradicted that option."""
-    _head: str = ""
-    _heads: int = 0
-    """The first word of the last sensors frames if this profile does not use it, and the number of these frames."""
+    _other_head: str = ""
+    _other_head_frames: int = 0
+    """The first word of the last sensors frames, if this profile has another one, and the number of these frames."""
     _is_read: bool = False
     """True if a frame with the head of this profile has arrived on this link."""
 
@@ -99,12 +103,14 @@ class PlatformDetector:
     @property
     def contradictions(self) -> tuple[str, ...]:
         """Return the contradictions of the profile that hold now, in words."""
-        return tuple(words for words, shown in self._against.items() if shown.holds)
+        return tuple(words for words, shown in self._found_contradictions.items() if shown.holds)
 
     @property
     def doubted(self) -> bool:
         """Return True if readings contradict the profile now. A missing option is not a contradiction."""
-        return any(shown.holds for words, shown in self._against.items() if words not in self._extra_options)
+        return any(
+            shown.holds for words, shown in self._found_contradictions.items() if words not in self._extra_options
+        )
 
     @property
     def open_mode(self) -> bool:
@@ -124,12 +130,12 @@ class PlatformDetector:
     def begin_link(self) -> None:
         """Forget the mode and the head that the readings of the last link showed."""
         self._open_mode = _PlatformEvidence()
-        self._is_read, self._heads = False, 0
+        self._is_read, self._other_head_frames = False, 0
 
     @property
     def evidence(self) -> tuple[str, ...]:
         """Return the evidence for the profile, its contradictions, and its properties that were never observed."""
-        return (*self._why(), *self.contradictions, *self.profile.not_observed)
+        return (*self._evidence_for_profile(), *self.contradictions, *self.profile.not_observed)
 
     def on_event(self, event: Event, *, counts: bool = True) -> tuple[str, ...]:
         """Update the evidence, and with `auto` the profile. Return new contradictions, in words.
@@ -137,7 +143,7 @@ class PlatformDetector:
         With `counts` False, use only the head of a reading.
         """
         if isinstance(event, Sensors):
-            self._is_read, self._heads = True, 0
+            self._is_read, self._other_head_frames = True, 0
             if not counts:
                 return ()
         match event:
@@ -179,8 +185,8 @@ class PlatformDetector:
 
         If the car counted as such only because of its silence, the first reading is enough.
         """
-        self._frames[NO_READINGS] = self._frames.get(NO_READINGS, 0) + 1
-        if not self._assumed_silent and self._frames[NO_READINGS] < EVIDENCE_FRAMES:
+        self._signs[NO_READINGS] = self._signs.get(NO_READINGS, 0) + 1
+        if not self._assumed_silent and self._signs[NO_READINGS] < EVIDENCE_FRAMES:
             return ()
         named, was_named = self.profile.name, not self._assumed_silent
         self._assumed_silent, self._is_heard = False, True
@@ -190,38 +196,38 @@ class PlatformDetector:
 
     def note(self, words: str) -> bool:
         """Add a contradiction that other evidence has shown. Return True if it is new."""
-        if words in self._against:
+        if words in self._found_contradictions:
             return False
         self._extra_options.add(words)
-        self._against[words] = _PlatformEvidence(holds=True)
+        self._found_contradictions[words] = _PlatformEvidence(holds=True)
         return True
 
     def _count_variant(self, option: str) -> None:
         """Count one sign of a variant of the program. With `auto`, three signs add the option to the profile."""
-        self._frames[option] = self._frames.get(option, 0) + 1
-        if self.auto and self._frames[option] == EVIDENCE_FRAMES and option not in self.profile.options:
+        self._signs[option] = self._signs.get(option, 0) + 1
+        if self.auto and self._signs[option] == EVIDENCE_FRAMES and option not in self.profile.options:
             self._options |= {option}
             self._apply_evidence()
 
     def _check_profile(self, event: Sensors) -> tuple[str, ...]:
         """Update the contradictions of the profile. Only a frame of mode 0 can end a contradiction in mode 0."""
         observed = self.profile.contradictions(event)
-        if not observed and not self._against:
+        if not observed and not self._found_contradictions:
             return ()
         in_manual = only_candidate(event) is Mode.MANUAL
         for words in observed:
-            self._against.setdefault(words, _PlatformEvidence())
-        judged = [words for words in self._against if words not in self._extra_options]
+            self._found_contradictions.setdefault(words, _PlatformEvidence())
+        judged = [words for words in self._found_contradictions if words not in self._extra_options]
         affected = [words for words in judged if in_manual or words in observed]
-        new = tuple(words for words in affected if self._against[words].update(shown=words in observed))
+        new = tuple(words for words in affected if self._found_contradictions[words].update(shown=words in observed))
         for words in affected:
-            if words not in observed and not self._against[words].holds:
-                del self._against[words]
+            if words not in observed and not self._found_contradictions[words].holds:
+                del self._found_contradictions[words]
         return new
 
     def _count_option(self, option: str) -> tuple[str, ...]:
-        self._frames[option] = self._frames.get(option, 0) + 1
-        if self._frames[option] != EVIDENCE_FRAMES or option in self.profile.options:
+        self._signs[option] = self._signs.get(option, 0) + 1
+        if self._signs[option] != EVIDENCE_FRAMES or option in self.profile.options:
             return ()
         if self.auto:
             self._options |= {option}
@@ -234,9 +240,9 @@ class PlatformDetector:
         """Count one sensors frame that begins with another word than those of this profile."""
         if head is None or head == self.profile.dialect.head:
             return ()
-        self._heads = self._heads + 1 if head == self._head else 1
-        self._head = head
-        if self._heads != (OTHER_PROGRAM_FRAMES if self._is_read else EVIDENCE_FRAMES):
+        self._other_head_frames = self._other_head_frames + 1 if head == self._other_head else 1
+        self._other_head = head
+        if self._other_head_frames != (OTHER_PROGRAM_FRAMES if self._is_read else EVIDENCE_FRAMES):
             return ()
         self._is_read = False
         option = f"{HEAD}={head}"
@@ -244,8 +250,7 @@ class PlatformDetector:
             self._options = _without_head(self._options) | {option}
             self._apply_evidence()
             return ()
-        # Only cars with this head send such frames, so the configured option is wrong. With it, no reading could be
-        # read.
+        # Only cars with this head send such frames, so the configured head is wrong. With it, no frame could be read.
         named = self.profile.name
         self.profile = _profile_of(self.profile.kind, _without_head(self.profile.options) | {option})
         words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"
@@ -266,8 +271,10 @@ class PlatformDetector:
             _CONSTANT_READINGS: in_manual and whole and pi_constants(event),
             _WIDE_READINGS: in_manual and event.grayscale is not None and event.grayscale > GRAY_10_BIT,
         }
-        self._count_alone(with_modes=shown[_MODE_READINGS] or shown[_MEASURED_READINGS], pi=shown[_CONSTANT_READINGS])
-        for words, seen in self._seen.items():
+        self._count_one_kind(
+            with_modes=shown[_MODE_READINGS] or shown[_MEASURED_READINGS], pi=shown[_CONSTANT_READINGS]
+        )
+        for words, seen in self._observations.items():
             if seen.update(shown=shown[words]):
                 if words is _CONSTANT_READINGS:
                     self._raspberry_pi = words
@@ -277,14 +284,14 @@ class PlatformDetector:
                     self._with_modes = self._with_modes or words
                 self._apply_evidence()
 
-    def _count_alone(self, *, with_modes: bool, pi: bool) -> None:
+    def _count_one_kind(self, *, with_modes: bool, pi: bool) -> None:
         """Count a reading that only one kind sends. After many of them, drop the evidence for the other kind."""
         if with_modes is pi:
-            self._alone = 0
+            self._one_kind_readings = 0
             return
-        self._alone = self._alone + 1 if with_modes is self._alone_has_modes else 1
-        self._alone_has_modes = with_modes
-        if self._alone != OTHER_PROGRAM_FRAMES or not (self._with_modes and self._raspberry_pi):
+        self._one_kind_readings = self._one_kind_readings + 1 if with_modes is self._one_kind_has_modes else 1
+        self._one_kind_has_modes = with_modes
+        if self._one_kind_readings != OTHER_PROGRAM_FRAMES or not (self._with_modes and self._raspberry_pi):
             return
         if with_modes:
             self._raspberry_pi = ""
@@ -295,9 +302,9 @@ class PlatformDetector:
     def forget(self) -> None:
         """Forget the evidence about the program, because another program is running."""
         self._with_modes = self._raspberry_pi = ""
-        self._is_wide, self._alone, self._readings = False, 0, 0
-        for words in self._seen:
-            self._seen[words] = _PlatformEvidence()
+        self._is_wide, self._one_kind_readings, self._readings = False, 0, 0
+        for words in self._observations:
+            self._observations[words] = _PlatformEvidence()
         self._apply_evidence()
 
     def _apply_evidence(self) -> None:
@@ -312,9 +319,9 @@ class PlatformDetector:
         profile = _profile_of(kind, options - {NO_READINGS} if self._is_heard else options)
         if profile.name != self.profile.name:
             self.profile = profile
-            self._against.clear()
+            self._found_contradictions.clear()
 
-    def _why(self) -> tuple[str, ...]:
+    def _evidence_for_profile(self) -> tuple[str, ...]:
         if not self.auto:
             return ()
         if self._with_modes and self._raspberry_pi:
