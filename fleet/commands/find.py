@@ -83,7 +83,7 @@ def find(
     except ValueError as error:
         raise click.UsageError(f"--since: {error}") from None
     place = existing_sessions_place(directory)
-    answers = list(_answers(place, expression, cars, for_s or 0.0, since_ns))
+    answers = list(_search(place, expression, cars, for_s or 0.0, since_ns))
     found = [(path, hit) for path, answer in answers for hit in answer.hits]
     if as_json:
         for path, hit in found:
@@ -104,10 +104,10 @@ def find(
         raise click.ClickException(f"{expression} was never true{how_long} in the sessions in {place}{after}.")
 
 
-def _answers(
+def _search(
     place: Path, expression: "Expression", cars: tuple[str, ...], for_s: float, since_ns: int
 ) -> Iterator[tuple[Path, "Found"]]:
-    """Yield each session with its hits. Print on stderr what could not be searched."""
+    """Search the sessions. Yield each with its hits, and print on stderr what could not be searched."""
     from fleet.recording.reading.session import NoSession, Session
     from fleet.recording.tools.find import find_in
     from fleet.recording.tools.summary import of_session
@@ -144,12 +144,12 @@ def _mark_sessions(found: list[tuple[Path, "Hit"]], expression: "Expression") ->
     for path, hit in found:
         hits.setdefault(path, []).append(hit)
     are_marked = True
-    for path, some in hits.items():
-        count = "1 hit" if len(some) == 1 else f"{len(some)} hits"
-        text = f"{expression}: {some[0].car}, {count}"[:MAX_MARK_CHARACTERS]
+    for path, of_session in hits.items():
+        count = "1 hit" if len(of_session) == 1 else f"{len(of_session)} hits"
+        text = f"{expression}: {of_session[0].car}, {count}"[:MAX_MARK_CHARACTERS]
         try:
             # The author is the person without the process, so that the same search finds its own mark again tomorrow.
-            add_mark(path, some[0].begin_ns, text, keys.person_of(default_sender(chosen_person())))
+            add_mark(path, of_session[0].begin_ns, text, keys.person_of(default_sender(chosen_person())))
         except (NoMark, OSError) as error:
             words = error.strerror if isinstance(error, OSError) else error
             echo_safely(f"{path.name}: not marked: {words}", err=True)

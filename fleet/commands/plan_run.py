@@ -66,7 +66,7 @@ def run(
     starter: int | None,
     as_json: bool,
 ) -> None:
-    """Run a plan until Ctrl-C, and print one line per decision. The plan leaves cars alone that you have stopped."""
+    """Run a plan until Ctrl-C, and print one line per decision. The plan leaves alone what you have stopped."""
     parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
     file = None if fleet_file is None else read_fleet(fleet_file, unbound=True)
@@ -80,7 +80,7 @@ def run(
     signals.calls(stop.set)
 
     def on_decided(decision: Decision) -> None:
-        click.echo(_json(decision) if as_json else line(decision))
+        click.echo(_json(decision) if as_json else decision_line(decision))
 
     with Fleet(
         connect,
@@ -104,7 +104,7 @@ def run(
             raise click.ClickException(str(error)) from None
 
 
-def line(decision: Decision) -> str:
+def decision_line(decision: Decision) -> str:
     """Return a decision as text for a person."""
     readings = f" ({', '.join(decision.readings)})" if decision.readings else ""
     return (

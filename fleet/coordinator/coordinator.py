@@ -73,7 +73,7 @@ class Coordinator:
     _commands: OpenCommands = field(init=False)
 
     def __post_init__(self) -> None:
-        self._inbox = Inbox(self.client, lambda: {"state/*", *(topic_of(name) for name in self.plan.names)})
+        self._inbox = Inbox(self.client, lambda: {"state/*", *(topic_of(name) for name in self.plan.read_names)})
         self._publications = Publications(self.client, self.on_failure)
         self._commands = OpenCommands(self.client, self.on_failure)
 
@@ -146,7 +146,7 @@ class Coordinator:
             assert command.mode is not None
             refusal = None if outcome.ok else Refusal(command.mode, outcome.reason, outcome.words, now)
             observer.on_outcome(command.car, refusal)
-        observer.forget(now, {*self.plan.named, *self._memory.held_roles, *self._commands.busy})
+        observer.forget(now, {*self.plan.named_cars, *self._memory.held_roles, *self._commands.busy})
         result = step(self.plan, observer.snapshot(self._commands.busy), self._memory, now)
         before, self._memory = self._memory, result.memory
         # Persist before anything is published or commanded. If this coordinator is killed now, the next one knows the
@@ -197,7 +197,7 @@ class Coordinator:
     def _put_in_force(self, plan: Plan, set_by: str = "") -> None:
         """Put a plan in force: subscribe to the readings that it uses, and publish it."""
         self.plan = plan
-        for topic in sorted({topic_of(name) for name in plan.names}):
+        for topic in sorted({topic_of(name) for name in plan.read_names}):
             if not topic.startswith("state/"):
                 self._inbox.subscribe(f"{self.client.name}/*/{topic}")
         self._publications.publish("plan", pb.Plan(text=plan.text, version=plan.version, set_by=set_by))

@@ -232,7 +232,7 @@ def _conclude(
 
 def _cars_of(plan: Plan, snapshot: FleetSnapshot) -> tuple[str, ...]:
     """Return the cars to decide about: the cars that the plan names, and all others if the plan is open to any car."""
-    return tuple(sorted({*plan.named, *snapshot.cars})) if plan.open else tuple(sorted(plan.named))
+    return tuple(sorted({*plan.named_cars, *snapshot.cars})) if plan.is_open else tuple(sorted(plan.named_cars))
 
 
 def _has_no_state(known: CarSnapshot) -> bool:

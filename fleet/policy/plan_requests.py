@@ -53,7 +53,7 @@ def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, n
     """Return the state after the request of the sender `by`, and a text about it. Raises RequestRefused."""
     match request:
         case PlanRequest.RESTART:
-            begins = f" with phase {plan.first}" if plan.first else ""
+            begins = f" with phase {plan.first_phase}" if plan.first_phase else ""
             return PolicyState(started_at=memory.started_at), f"plan {plan.version} starts again{begins}"
         case PlanRequest.NEXT:
             name = _next_phase(plan, memory)
@@ -75,7 +75,7 @@ def _next_phase(plan: Plan, memory: PolicyState) -> str:
     if name is None:
         raise RequestRefused(
             f"Phase {phase.name} is the last one: `next` names none after it. "
-            f"`fleet plan restart` begins with {plan.first}."
+            f"`fleet plan restart` begins with {plan.first_phase}."
         )
     return name
 

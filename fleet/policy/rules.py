@@ -197,7 +197,7 @@ def follow_phase(
     """
     phase = plan.phases.get(before.name)
     if phase is None:
-        return PhaseState(plan.first, now, why="the plan begins with it" if plan.first else "")
+        return PhaseState(plan.first_phase, now, why="the plan begins with it" if plan.first_phase else "")
     lasted_s = now - before.since
     for index, state in rules.items():
         rule = plan.rules[index]

@@ -20,7 +20,7 @@ Where = tuple[str | int, ...]
 _MAX_VALUE_LENGTH: Final = 60
 _MAX_WORDS_LISTED: Final = 12
 _ITEMS: Final = {"boxes": "box", "capabilities": "capability", "line": "point", "path": "point", "then": "effect"}
-"""Names of a list's items, for lists where that is not the list's name without its s."""
+"""How an item of a list is called, by the name of the list. For other lists: the name of the list without its s."""
 _TYPES: Final = {
     "string": "text",
     "integer": "a whole number",
@@ -90,18 +90,18 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
     value = error["input"]
     if kind in ("too_short", "too_long"):
         limits = error["ctx"]
-        most = f"at most {limits['max_length']}" if kind == "too_long" else f"at least {limits['min_length']}"
-        return f"has {len(value)} items", f"Write {most}."
+        bound = f"at most {limits['max_length']}" if kind == "too_long" else f"at least {limits['min_length']}"
+        return f"has {len(value)} items", f"Write {bound}."
     if kind in ("value_error", "assertion_error"):
         return str(error["ctx"]["error"]), ""
-    head = "has no value" if value is None else f"{quote_value(value)} is not allowed"
-    chosen = ["enum" in each or "const" in each for each in here]
-    if kind in ("enum", "literal_error") and (all(chosen) or not any(chosen)):
+    fault = "has no value" if value is None else f"{quote_value(value)} is not allowed"
+    has_words = ["enum" in each or "const" in each for each in here]
+    if kind in ("enum", "literal_error") and (all(has_words) or not any(has_words)):
         words = [str(word) for each in here for word in each.get("enum", [each["const"]] if "const" in each else [])]
-        return (head, suggest(str(value), words)) if words else (head, f"Write {error['ctx']['expected']}.")
-    if where and all(each.get("type") == "object" and "properties" in each for each in here) and here:
+        return (fault, suggest(str(value), words)) if words else (fault, f"Write {error['ctx']['expected']}.")
+    if where and here and all(each.get("type") == "object" and "properties" in each for each in here):
         return (
-            head if value is None else "needs fields",
+            fault if value is None else "needs fields",
             f"Write: `{where[-1]}: {_example(here[0], value, definitions)}`",
         )
     allowed_here = [words for words in map(_describe_allowed, here) if words and words != "nothing"]
@@ -109,13 +109,14 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
     if allowed_here and kind.endswith(kinds):
         words = [str(word) for each in here for word in each.get("enum", ())]
         if isinstance(value, str) and (near := did_you_mean(value, words)):
-            return head, near
+            return fault, near
         if kind.endswith("_type") and isinstance(value, bool | int | float):
-            # Each member of a union has an error of its own: the same words for all of them.
+            # A number is not text unless it has quotes. Say so in the errors of all members of a union, so that
+            # document.py can merge them.
             allowed_here = ["text in quotes" if each == "text" else each for each in allowed_here]
-        return head, f"Write {' or '.join(dict.fromkeys(allowed_here))}."
+        return fault, f"Write {' or '.join(dict.fromkeys(allowed_here))}."
     message = str(error["msg"])
-    return head, _sentence(message)
+    return fault, _sentence(message)
 
 
 def _sentence(words: str) -> str:

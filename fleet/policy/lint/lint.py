@@ -96,7 +96,7 @@ def find_faults(
 
 
 def _cars_named_in(plan: Plan) -> set[str]:
-    return set(plan.named) | {condition.car for condition in plan.conditions if condition.car is not None}
+    return set(plan.named_cars) | {condition.car for condition in plan.conditions if condition.car is not None}
 
 
 def check(plan: Plan, fleet: Mapping[str, CarSnapshot] | None = None) -> tuple[PlanFault, ...]:
@@ -300,7 +300,7 @@ class _Check:
 
     def _phases(self) -> Iterator[PlanFault]:
         plan = self._plan
-        reached = {plan.first}
+        reached = {plan.first_phase}
         jumps = [
             (rule.during, effect.phase) for rule in plan.rules for effect in rule.effects if effect.phase is not None
         ]
@@ -313,7 +313,7 @@ class _Check:
         for name, phase in plan.phases.items():
             part = f"phase {name}"
             if name not in reached:
-                yield PlanFault(Severity.ERROR, part, f"nothing leads to it: the plan begins with {plan.first}")
+                yield PlanFault(Severity.ERROR, part, f"nothing leads to it: the plan begins with {plan.first_phase}")
             if phase.timeout_s is not None and phase.timeout_s < HYSTERESIS_S:
                 words = f"it lasts {HYSTERESIS_S:g} s at least, whatever timeout_s says"
                 yield PlanFault(Severity.WARNING, part, words)

@@ -75,7 +75,7 @@ class ModeReachability:
     def __init__(self, plan: Plan, fleet: Mapping[str, CarSnapshot] | None, named: Iterable[str]) -> None:
         self._plan = plan
         self._has_fleet_file = fleet is not None
-        others = (ANY_CAR,) if plan.open else ()
+        others = (ANY_CAR,) if plan.is_open else ()
         self.cars = fleet if fleet is not None else dict.fromkeys((*sorted(named), *others), CarSnapshot())
         self._able = {
             (car, name): not self.explain_barrier(car, role) for name, role in plan.roles.items() for car in self.cars
@@ -206,7 +206,7 @@ class ModeReachability:
     def _list_watched_cars(self, condition: PlanCondition) -> Iterable[str]:
         if condition.car is not None:
             return (condition.car,)
-        return self.cars if self._plan.open else [car for car in self._plan.named if car in self.cars]
+        return self.cars if self._plan.is_open else [car for car in self._plan.named_cars if car in self.cars]
 
     def _find_modes(self, car: str, phase: str, condition: PlanCondition) -> dict[Mode, str]:
         """Return the modes that the plan can bring a watched car into, each with the only case in which it does so.

@@ -74,7 +74,7 @@ class Role:
     capabilities: frozenset[str] = frozenset()
     platforms: tuple[str, ...] | None = None
     if_none: str | None = None
-    """The role that gets an additional place for each place of this role that no car can fill."""
+    """The fallback: for each place of this role that no car can fill, the fallback gets one more place."""
     by_rules: bool = False
     """True if only rules give this role to cars."""
     needs_text: str = field(init=False, compare=False)
@@ -141,19 +141,19 @@ class Plan:
         return version_of(self.text)
 
     @property
-    def first(self) -> str:
+    def first_phase(self) -> str:
         """The first phase, or an empty text if there are none."""
         return next(iter(self.phases), "")
 
     @property
-    def open(self) -> bool:
+    def is_open(self) -> bool:
         """True if the plan may affect cars that it does not name."""
         if any(role.cars is None for role in self.roles.values()):
             return True
         return any(effect.who in (THIS_CAR, OTHER_CARS, ALL_CARS) for rule in self.rules for effect in rule.effects)
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def named_cars(self) -> tuple[str, ...]:
         """The cars that the plan names in roles and effects."""
         targets = (effect.who for rule in self.rules for effect in rule.effects)
         cars = [*self.fixed, *(car for role in self.roles.values() for car in role.cars or ())]
@@ -171,8 +171,8 @@ class Plan:
                 yield phase.until
 
     @property
-    def names(self) -> frozenset[str]:
-        """The names (snapshot.NAMES) that its expressions use."""
+    def read_names(self) -> frozenset[str]:
+        """The names (snapshot.NAMES) of the values that its expressions read."""
         needs = [role.needs for role in self.roles.values() if role.needs is not None]
         used = [*needs, *(condition.expression for condition in self.conditions)]
         return frozenset(name for expression in used for name in expression.names)

@@ -52,7 +52,7 @@ class _NewPlan:
 
 def keys_for(fleet: str, plans: Iterable[Plan]) -> list[str]:
     """Return the key expressions that a coordinator with these plans subscribes to, and that of command outcomes."""
-    topics = {topic_of(name) for plan in plans for name in plan.names}
+    topics = {topic_of(name) for plan in plans for name in plan.read_names}
     return [f"{fleet}/*/{topic}" for topic in ("state/*", "event/command", *sorted(topics)) if topic]
 
 
@@ -181,7 +181,7 @@ class Replanning:
         if self._state is None or at_ns < self._stepped_ns:
             return
         self._stepped_ns = at_ns
-        self._observer.forget(at_ns / 1e9, {*self._plan.named, *self._state.held_roles})
+        self._observer.forget(at_ns / 1e9, {*self._plan.named_cars, *self._state.held_roles})
         result = step(self._plan, self._observer.snapshot(self._busy), self._state, at_ns / 1e9)
         self._state = result.memory
         for each in result.changed:

@@ -102,7 +102,7 @@ def test_ten_thousand_names_are_decided_rarely_and_forgotten() -> None:
             if number == 98:
                 come(observer, name, now)
             observer.on_token(name, now, alive=False)
-        observer.forget(now, {*plan.named, *memory.held_roles})
+        observer.forget(now, {*plan.named_cars, *memory.held_roles})
         result = step(plan, observer.snapshot(()), memory, now)
         memory = result.memory
         decisions += len(result.changed) + len(result.reworded)
