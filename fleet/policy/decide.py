@@ -49,7 +49,7 @@ from fleet.policy.explain import (
     is_reworded,
 )
 from fleet.policy.plan.plan import Effect, Plan, Rule
-from fleet.policy.role_allocation import Barrier, Candidates, RoleAllocation, allocate, follow_needs
+from fleet.policy.role_allocation import Barrier, Candidates, PinnedRole, RoleAllocation, allocate, follow_needs
 from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import (
@@ -331,16 +331,13 @@ def _effects_in_force(plan: Plan, rules: Mapping[int, RuleState]) -> Iterator[tu
                 yield index, rule, state, effect
 
 
-def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, tuple[str, str]]:
-    """Return the cars to which a rule in force leaves only one role: that role and the rule, by car.
-
-    If several rules do so for a car, the first one counts.
-    """
-    result: dict[str, tuple[str, str]] = {}
+def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, PinnedRole]:
+    """Return by car the role that a rule pins. If several rules pin roles of one car, the first one counts."""
+    result: dict[str, PinnedRole] = {}
     for _, rule, state, effect in _effects_in_force(plan, rules):
         if effect.role is not None:
             for car in targets(effect, state, subjects, {}):
-                result.setdefault(car, (effect.role, rule.name))
+                result.setdefault(car, PinnedRole(effect.role, rule.name))
     return result
 
 
@@ -350,7 +347,7 @@ def _overrides(
     rules: Mapping[int, RuleState],
     subjects: tuple[str, ...],
     roles: Mapping[str, str],
-    pinned: Mapping[str, tuple[str, str]],
+    pinned: Mapping[str, PinnedRole],
 ) -> dict[str, Override]:
     """Return the modes that rules in force give cars, whatever their roles say. The first rule counts.
 
@@ -366,7 +363,7 @@ def _overrides(
                     result[car] = Override(rule, state, effect)
         elif effect.role is not None:
             # The first rule in force counts for a car, also if it gives a role: later rules cannot give it a mode.
-            decided |= {car for car in targets(effect, state, subjects, roles) if pinned[car][1] == rule.name}
+            decided |= {car for car in targets(effect, state, subjects, roles) if pinned[car].rule == rule.name}
     return result
 
 

@@ -133,10 +133,10 @@ def explain_role(
     plan, name = candidates.plan, held_role.role
     role = plan.roles[name]
     pinned = candidates.pinned.get(car)
-    cause = f"role {name}, {pinned[1]}" if pinned is not None else f"role {name}"
+    cause = f"role {name}, {pinned.rule}" if pinned is not None else f"role {name}"
     why = f"role {name} ({_count(role, allocation)})"
     if pinned is not None:
-        why += f", as {pinned[1]} wants"
+        why += f", as {pinned.rule} wants"
     elif name in allocation.stands_in:
         why += f", which stands in for {allocation.stands_in[name]}"
     if held_role.why:
@@ -148,7 +148,7 @@ def explain_role(
     if role.needs is not None:
         old = describe_unmeasured(role.needs, [(known, role.mode)], ": the last value counts")
         changes.append(f"{role.needs_text} becomes false{old}")
-    changes += [f"{pinned[1]} ends"] if pinned is not None else _rules_against(car, known, role, plan, phase)
+    changes += [f"{pinned.rule} ends"] if pinned is not None else _rules_against(car, known, role, plan, phase)
     if any(each.roles is not None and name not in each.roles for each in plan.phases.values()):
         changes.append(f"phase {phase} ends")
     changes.append("a person stops or drives it")

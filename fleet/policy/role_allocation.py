@@ -7,7 +7,7 @@ in the plan decides the rest.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from fleet.conditions import Expression
 from fleet.policy.debounce import Settled, settle
@@ -41,6 +41,13 @@ class Barrier:
     """True if a person has taken the car for longer, so that the car loses its role at once."""
 
 
+class PinnedRole(NamedTuple):
+    """The only role that a rule in force lets a car have."""
+
+    role: str
+    rule: str
+
+
 @dataclass(frozen=True, slots=True)
 class Candidates:
     """The cars that may get roles, and everything that decides which car may have which role."""
@@ -54,8 +61,8 @@ class Candidates:
     """The role of each car before this step."""
     unresponsive: frozenset[str]
     """Cars that were commanded into their mode more than once and are not in it."""
-    pinned: Mapping[str, tuple[str, str]]
-    """By car: the only role that a rule lets it have, and the rule's name."""
+    pinned: Mapping[str, PinnedRole]
+    """By car."""
     in_force: frozenset[str]
     """The roles that count in this phase."""
     needs: Mapping[tuple[str, str], Settled]
@@ -71,8 +78,8 @@ class Candidates:
         """Return why this car may not have this role, None if it may."""
         name = role.name
         pinned = self.pinned.get(car)
-        if pinned is not None and pinned[0] != name:
-            return Barrier(f"{pinned[1]} leaves it {pinned[0]} only", f"{pinned[1]} ends")
+        if pinned is not None and pinned.role != name:
+            return Barrier(f"{pinned.rule} leaves it {pinned.role} only", f"{pinned.rule} ends")
         if not self.plan.may(car, role):
             return Barrier("the plan does not give it to this car", "another plan is put in force")
         if role.by_rules and pinned is None and not any(name == other.if_none for other in self.plan.roles.values()):
@@ -203,7 +210,7 @@ def _count_places(candidates: Candidates, role: Role, cars: int) -> int:
     count = cars if role.count is None else role.count
     if not role.by_rules:
         return count
-    return min(count, sum(name == role.name for name, _ in candidates.pinned.values()))
+    return min(count, sum(pinned.role == role.name for pinned in candidates.pinned.values()))
 
 
 def _fallback_order(plan: Plan) -> list[str]:
@@ -250,7 +257,7 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
             reserved_role = candidates.reserved.get(car)
             if reserved_role is not None:
                 pinned = candidates.pinned.get(car)
-                if reserved_role != role.name or (pinned is not None and pinned[0] != reserved_role):
+                if reserved_role != role.name or (pinned is not None and pinned.role != reserved_role):
                     continue
             elif candidates.barrier(car, role) is not None:
                 continue

@@ -348,8 +348,8 @@ class StopEvidence:
         ranging_s = 0.0 if has_echo else self.profile.ranging_s  # without an echo, the ranging delays the report
         before, self._echo_report_at = self._echo_report_at, at if has_echo else None
         before_no_echo, self._no_echo_report_at = self._no_echo_report_at, None if has_echo else at
-        # A car may read a frame only after it has sent this report, if the frame was written just before the report or
-        # during its ranging. So such a frame may also block the next report.
+        # If a frame was written just before this report, or during its ranging, the car may read it only after the
+        # report. So keep its block for the next report, too.
         blocks, self._blocks = self._blocks, [each for each in self._blocks if at - each.at < READ_LATE_S + ranging_s]
         other_written, self._other_frame_written = self._other_frame_written, False
         self.without_echo = 0 if has_echo else self.without_echo + 1
