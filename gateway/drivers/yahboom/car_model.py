@@ -43,9 +43,9 @@ class CarModel:
     trust: TrustState = field(default_factory=TrustState)
     rest_case: StopCase = cases.SOFT
     """The case of the last stop, if the claim that the car is at rest has the basis `sent`."""
-    left_at: float = float("-inf")
-    left_until: float = float("-inf")
-    """When the last frame that leaves a mode was written, and the latest time at which the car has left the mode."""
+    mode_closed_at: float = float("-inf")
+    mode_left_by: float = float("-inf")
+    """When the last `MODE00` that closes a mode was written, and the latest time at which the car has left the mode."""
     range_cm: float | None = None
     """The last measured distance, and its time."""
     range_at: float = float("-inf")
@@ -261,7 +261,7 @@ class CarModel:
     @property
     def ready_at(self) -> float:
         """Return the earliest time for a frame that belongs to no stop."""
-        return max(self.pacing.flight_until, self.left_until)
+        return max(self.pacing.flight_until, self.mode_left_by)
 
     def is_awake(self, now: float) -> bool:
         """Return True if the car reads a frame at once, because no block, known or only possible, is running."""

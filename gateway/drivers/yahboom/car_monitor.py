@@ -63,7 +63,7 @@ class CarMonitor:
     def link_down(self) -> None:
         """Forget the platform from before this link, if the car was silent after a frame that only it understands."""
         model = self.model
-        is_silent = model.left_at > model.link_since > model.mode.heard_at
+        is_silent = model.mode_closed_at > model.link_since > model.mode.heard_at
         if model.platform.is_remembered and is_silent:
             model.learned.opened_as = ""
 
@@ -110,8 +110,8 @@ class CarMonitor:
         """Update the model with a report of mode 0."""
         model = self.model
         model.learned.on_fields(event, model.profile.rejects(event))
-        if event.at > model.left_at + FLIGHT_S:
-            model.left_until = float("-inf")
+        if event.at > model.mode_closed_at + FLIGHT_S:
+            model.mode_left_by = float("-inf")
             if model.trust.state is not CarTrust.IN_MODE or model.mode.is_left:
                 model.learned.opened_as = ""
         if event.range_cm is not None:

@@ -126,7 +126,7 @@ class Executor(Driver):
             return None
         # The color frame that clears a string uses the last color, even if somebody has set it during this stop.
         frame = self.model.believed.led if isinstance(running.frame, ColorLed) else running.frame
-        return self._write(frame, running.why, running, running.commands[0] if running.commands else None)
+        return self._prepare(frame, running.why, running, running.commands[0] if running.commands else None)
 
     def _next_command(self, now: float) -> OutgoingFrame | None:
         model, queue = self.model, self.queue
@@ -135,17 +135,19 @@ class Executor(Driver):
         held = queue.held
         if held is not None and not held.pending.sent and self._may_overtake(held.pending):
             self.stops.give_way(now)
-            return self._write(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
+            return self._prepare(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
         if (change := self._next_mode) is not None:
             return self._open_mode(change, now)
         pending = None if self._actions_wait(now) else queue.next_part(now)
         if pending is not None and now >= model.pacing.act_at(pending.next_frame) and self._may_overtake(pending):
             frame = model.believed.with_motion(pending.next_frame)
-            return self._write(frame, FrameOrigin.COMMAND, pending, pending)
+            return self._prepare(frame, FrameOrigin.COMMAND, pending, pending)
         if self.stops.running is not None:
             return None
         if self._repeats(now) and now >= model.pacing.repeat_at:
-            return self._write(General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None)
+            return self._prepare(
+                General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None
+            )
         return self._renew_stop(now)
 
     @property
@@ -167,7 +169,7 @@ class Executor(Driver):
         if now < model.pacing.open_at(now, can_show=model.can_show):
             return None
         self.stops.give_way(now)
-        return self._write(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
+        return self._prepare(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
         """Return the longest time that a mode would wait for its frame, s. `busy_s` is the wait of a motion."""
@@ -265,7 +267,7 @@ class Executor(Driver):
         if renewal.is_full_stop:
             renewal.schedule(now)
             return self._begin_stop(self.stops.full(now), FrameOrigin.REPEAT, now)
-        return self._write(renewal.next_frame(now), FrameOrigin.REPEAT, None, None)
+        return self._prepare(renewal.next_frame(now), FrameOrigin.REPEAT, None, None)
 
     def _begin_stop(
         self, sequence: StopSequence, why: FrameOrigin, now: float, mode_command: Pending | None = None
@@ -277,10 +279,12 @@ class Executor(Driver):
         self.stops.running.repeats = why is FrameOrigin.REPEAT
         return self._next_step(self.stops.running, now)
 
-    def _write(
+    def _prepare(
         self, frame: Frame, why: FrameOrigin, source: StopInProgress | HeldMotion | Pending | None, by: Pending | None
     ) -> OutgoingFrame:
+        """Return a frame for the caller of `poll`, who writes it. Remember what it is for, until `on_written`."""
         self._source = source
+        # A general frame also sets the fan. Except for the command to switch the fan, leave it as it is.
         if not (isinstance(source, Pending) and isinstance(source.command.what, Fan)):
             frame = self.model.believed.with_fan(frame)
         return OutgoingFrame(frame, self.model.profile.encode(frame), why, by.command.id if by is not None else "")
@@ -295,7 +299,7 @@ class Executor(Driver):
             if not model.manual:
                 # One turn of the mode may ignore frames for longer than it takes to close the mode.
                 deaf_until = max(now, model.pacing.block_until) + model.for_stop(now).turn_s
-                model.left_at, model.left_until = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
+                model.mode_closed_at, model.mode_left_by = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
             model.evidence.on_mode_00(now, awake=model.is_awake(now))
         model.pacing.on_written(frame, now)
         self._update_model(frame, now)
@@ -456,7 +460,7 @@ class Executor(Driver):
         free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
         actions_wait = self._actions_wait(now)
         times.extend(
-            max(each.due_at, model.pacing.act_at(each.next_frame), model.left_until, free_at)
+            max(each.due_at, model.pacing.act_at(each.next_frame), model.mode_left_by, free_at)
             for each in (queue.turns if self._next_mode is None and not actions_wait else ())
             if self._may_overtake(each)
         )
@@ -468,7 +472,7 @@ class Executor(Driver):
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))
         if stopped and self._repeats(model.pacing.repeat_at):
-            times.append(max(model.pacing.repeat_at, model.left_until))
+            times.append(max(model.pacing.repeat_at, model.mode_left_by))
         if self._renews and queue.mode_change is None:
             times.append(max(self.stops.renewal.due_at, model.ready_at))
         return times

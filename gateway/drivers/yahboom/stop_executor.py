@@ -383,7 +383,7 @@ class StopExecutor:
         recovered = model.trust.state in STOP_GOES_ON and not model.known
         model.rest_case = case
         model.cut_write = False
-        self.renewal.left_mode = model.left_at >= running.began_at
+        self.renewal.left_mode = model.mode_closed_at >= running.began_at
         model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
         if recovered:
             how = "is stopped (confirmed)" if shown else f"got its stop (not confirmed: {words})"
