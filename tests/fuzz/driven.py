@@ -42,7 +42,7 @@ class Driven:
         known = platform if platform != "unknown" else moments.choice(["arduino", "raspberry_pi"])
         self.world = moments.choice(list(WORLDS))
         self.pair = Pair(
-            known.partition("+")[0],
+            known,
             seed=moments.randrange(10**6),
             world=WORLDS[self.world](),
             told=platform,

@@ -38,8 +38,16 @@ class Pair:
         traits: CarTraits | None = None,
     ) -> None:
         self.now = 0.0
+        built_as, *options = platform.split("+")  # such as arduino+arm
         self.car: Firmware = build(
-            platform, world or World.room(), 0, random.Random(seed), transport=transport, name=name, traits=traits
+            built_as,
+            world or World.room(),
+            0,
+            random.Random(seed),
+            options=frozenset(options),
+            transport=transport,
+            name=name,
+            traits=traits,
         )
         self.transport = transport
         self.control = control(parse_platform(told or platform), name=name)
