@@ -508,7 +508,8 @@ class Controller(Generic[D_co]):
         if command.streamed or (wait_s := self.wait_s(command.what, now)) < LATE_DRIVE_S:
             return ""
         if isinstance(command.what, SetMode):
-            return f"opens in {wait_s:.1f} s at most: {self.car} is stopped first"
+            after = " after the actions that wait" if self.driver.queue.has_undelayed else ""
+            return f"opens in {wait_s:.1f} s at most{after}: {self.car} is stopped first"
         if words := self.driver.wait_words(now):
             return f"begins after {words}"
         what = "a stop" if self.driver.is_stopping else "a command"

@@ -391,6 +391,16 @@ def test_a_drive_waits_for_the_recovery_at_the_connect() -> None:
     assert desk.life("it")[:3] == [ASKED, QUEUED, Phase.SENT], "also if the car sends nothing"
 
 
+@pytest.mark.parametrize("actions", [0, 5])
+def test_wait_of_a_mode_counts_after_waiting_actions(desk: Workbench, actions: int) -> None:
+    desk.ask(FORWARD)
+    for degrees in range(actions):
+        desk.ask(AimServo(degrees))
+    said = desk.ask(SetMode(Mode.TRACKING)).words
+    assert said.startswith("opens in ")
+    assert ("at most after" in said) is bool(actions)
+
+
 @pytest.mark.parametrize("what", [WHISTLE, SetMode(Mode.TRACKING)], ids=str)
 def test_queued_command_expires_for_busy_car(what: Action, monkeypatch: pytest.MonkeyPatch) -> None:
     """No car is busy for so long, so the limit is shortened."""
