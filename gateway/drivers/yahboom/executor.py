@@ -4,6 +4,7 @@
 frame may be written.
 """
 
+from collections import deque
 from typing import Final
 
 from gateway.control.command_log import Pending
@@ -21,9 +22,12 @@ from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stop_executor import StopExecutor
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.sequences import SOFT, STOP_FRAME, StopSequence
-from gateway.drivers.yahboom.stops.stop_in_progress import FREE_ACTIONS, StopInProgress
+from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
 from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
 
+FREE_ACTIONS: Final = 3
+"""Number of actions on parts of the car that are written at once. In a stream of more, the next ones may have to
+wait."""
 LISTEN_LIMITS: Final = 2.0
 """Time without a report after which a stream of actions waits for one, in silences that would contradict the mode."""
 NOTICE_S: Final = 0.2
@@ -44,9 +48,8 @@ class Executor(Driver):
         """A mode command whose effect was not seen yet, and the time of its frame."""
         self._source: StopInProgress | HeldMotion | Pending | None = None
         """The stop, motion or command of the frame that `poll` last returned. None for a repetition."""
-        self._actions = 0
-        """Number of frames of actions on parts of the car since the report at `_actions_since_report`."""
-        self._actions_since_report = float("-inf")
+        self._action_times: deque[float] = deque(maxlen=FREE_ACTIONS)
+        """When the frames of the last actions on parts of the car were written."""
 
     @property
     def model(self) -> CarModel:
@@ -217,15 +220,17 @@ class Executor(Driver):
         A block excuses a silence. So during an endless stream nobody would notice that a car drives that lost its stop.
         """
         mode = self.model.mode
+        if not self._has_stream_since(mode.heard_at):
+            return False
         limit_s = mode.silence_limit(fan=self.model.believed.fan_may_run)
-        if limit_s is None or self._actions_since(mode.heard_at) < FREE_ACTIONS:
+        if limit_s is None:
             return False
         is_due = now - mode.heard_at > LISTEN_LIMITS * limit_s
         return is_due and mode.unheard_s(now) <= limit_s + NOTICE_S
 
-    def _actions_since(self, heard_at: float) -> int:
-        """Return the number of frames of actions since the last report."""
-        return self._actions if heard_at == self._actions_since_report else 0
+    def _has_stream_since(self, at: float) -> bool:
+        """Return True if so many actions were written since then that the next ones may have to wait."""
+        return len(self._action_times) == FREE_ACTIONS and self._action_times[0] > at
 
     def _stop_goes_first(self, now: float) -> bool:
         """Return True if a stream of actions on parts of the car waits for the running stop.
@@ -235,7 +240,7 @@ class Executor(Driver):
         would show the stop; if a mode waits behind the actions, only as long as the next report may complete it.
         """
         running = self.stops.running
-        if running is None or not running.has_stream:
+        if running is None or not self._has_stream_since(running.began_at):
             return False
         may_show = self.model.can_show and not (running.is_soft or running.repeats or running.overdue)
         is_short = self.queue.mode_change is None or self.model.evidence.is_awaited
@@ -317,8 +322,7 @@ class Executor(Driver):
             case Pending():
                 if self.stops.running is not None:
                     self.stops.running.on_other_written(now)
-                self._actions = self._actions_since(model.mode.heard_at) + 1
-                self._actions_since_report = model.mode.heard_at
+                self._action_times.append(now)
                 self.queue.on_part_written(source, now)
             case None:
                 model.believed.repeat = False
@@ -445,7 +449,7 @@ class Executor(Driver):
         if running is not None:
             waits = self._has_new_command(now) and self.accepts_commands(now)
             times.extend(self.stops.timeouts(running) if waits else self.stops.deadlines(running, now))
-            if waits and not self._actions_wait(now):
+            if waits and self._has_stream_since(running.began_at) and not self._actions_wait(now):
                 times.append(running.goes_first_at)
         times.extend(self._command_times(now))
         return max(now, min(times, default=float("inf")))

@@ -194,15 +194,8 @@ class StopExecutor:
         if case is not None:
             self._finish(running, Basis.SENT, case.why(self.model.name), now, case)
             return
-        if self.model.evidence.settles_at is None and now >= self._next_try_at(running):
+        if self.model.evidence.settles_at is None and now >= running.try_due_at(self.model.pacing):
             self._try_again(running, now)
-
-    def _next_try_at(self, running: StopInProgress) -> float:
-        """Return when the stop is sent again, if the car has not shown it before."""
-        # If the car read `MODE00` in one string with a servo frame before it, it would take the digits of that frame.
-        pacing = self.model.pacing
-        follows_action = running.other_at > running.last_at
-        return max(running.next_try_at, pacing.buffer_until if follows_action else pacing.flight_until)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
         """Return the case as which the stop ends without evidence, or None if the car may still show it."""
@@ -410,7 +403,7 @@ class StopExecutor:
         if self.model.evidence.settles_at is not None:
             times.append(self.model.evidence.settles_at)
         elif running.frames_sent:
-            times.append(self._next_try_at(running))
+            times.append(running.try_due_at(self.model.pacing))
         if running.frames_sent and running.obeys_by > now:
             times.append(running.obeys_by)
         if not running.frames_sent:

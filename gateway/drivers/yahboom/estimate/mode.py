@@ -12,7 +12,7 @@ from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.protocol.modes import SILENT_MODES, candidate_modes
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.sensors import Sensors
-from gateway.drivers.yahboom.protocol.timing import FRAME_S, MODE_CLOSE_S, REPEAT_INTERVAL_S
+from gateway.drivers.yahboom.protocol.timing import FRAME_S, MODE_CLOSE_S, REPEAT_INTERVAL_S, SERVO_S
 from schemas.words import Mode, Verdict
 
 CONTRADICTING_FRAMES: Final = 3
@@ -28,7 +28,7 @@ SILENCE_MARGIN_S: Final = 0.75
 """How much longer than the car's longest normal interval a silence must be to contradict mode 0."""
 CORRUPTED_MATCH_S: Final = 0.5
 """Period after a reading of another mode in which a single match may be a corrupted frame, so three are required."""
-MAX_FADE_EXCUSE_S: Final = 0.65
+MAX_FADE_EXCUSE_S: Final = SERVO_S
 """Maximum time by which blocks of our frames prolong a confirmation: that of a servo. A stream of actions must not keep
 a claim alive that no reading supports any more."""
 MAX_BLOCKS: Final = 256

@@ -36,10 +36,8 @@ SLOWEST_S: Final = 3.0
 """Interval of the slowest car. It is used until the interval of this car is known."""
 REPORT_MARGIN_S: Final = 0.1
 """Margin of the wait for a report after the last frame of a try."""
-FREE_ACTIONS: Final = 3
-"""Number of actions on parts of the car that are written at once during one stop. A stream of more waits for it."""
 HELD_UP_S: Final = REPEAT_INTERVAL_S
-"""Maximum time for which such a stream holds up the next frame of a stop that is being repeated."""
+"""Maximum time for which a stream of actions holds up the next frame of a stop that is being repeated."""
 IN_TIME_S: Final = 0.2
 """Minimum time between writing a frame and the end of a block, so that the frame arrives before the end on any link."""
 
@@ -130,8 +128,6 @@ class StopInProgress:
     """When its last frame was written."""
     other_at: float = float("-inf")
     """When the last frame of another command was written during the stop."""
-    actions: int = 0
-    """Number of frames of actions on parts of the car that were written during the stop."""
     closed_at: float = float("-inf")
     """When the newest `MODE00` was written."""
     tries: int = 1
@@ -199,16 +195,15 @@ class StopInProgress:
         last_at = max(self.last_at, min(self.other_at, self.last_at + HELD_UP_S))
         return max(last_at + self.report_wait_s, after + RETRY_S[min(self.tries, len(RETRY_S)) - 1])
 
-    @property
-    def has_stream(self) -> bool:
-        """Return True if so many actions on parts of the car were written during the stop that the next ones wait."""
-        return self.actions >= FREE_ACTIONS
+    def try_due_at(self, pacing: Pacing) -> float:
+        """Return when the next try may begin, if the car has not shown the stop before."""
+        # If the car read `MODE00` in one string with a servo frame before it, it would take the digits of that frame.
+        follows_action = self.other_at > self.last_at
+        return max(self.next_try_at, pacing.buffer_until if follows_action else pacing.flight_until)
 
     @property
     def goes_first_at(self) -> float:
-        """Return when the next frame of the stop goes before a stream of actions; inf if there is no stream."""
-        if not self.has_stream:
-            return float("inf")
+        """Return when the next frame of the stop goes before a stream of actions."""
         if self.frames_sent:
             return self.next_try_at
         if self.tries > 1 and self.index > 0:
@@ -265,7 +260,6 @@ class StopInProgress:
     def on_other_written(self, now: float) -> None:
         """Delay the rest of the stop, so that its frames keep their distance from the command that was sent now."""
         self.other_at = now
-        self.actions += 1
         if self.index == 0:  # a try that has not begun
             self.try_at = max(self.try_at, now + FLIGHT_S)
 

@@ -12,11 +12,11 @@ import pytest
 
 from gateway.control.commands import Action, AimServo, Drive, Led, SetMode, Signal, Stop
 from gateway.drivers.yahboom.estimate.learned import Learned
+from gateway.drivers.yahboom.executor import FREE_ACTIONS
 from gateway.drivers.yahboom.pacing import Gate, Pacing
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stops import cases, sequences, stop_in_progress
-from gateway.drivers.yahboom.stops.stop_in_progress import FREE_ACTIONS
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
 from schemas.commands import Verb
