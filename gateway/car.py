@@ -29,6 +29,7 @@ from gateway.bus.estop_sync import EstopSync
 from gateway.bus.revocation_watch import RevocationWatch
 from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
+from gateway.control.driver import TICK_S
 from gateway.control.holds_and_leases import PersistedSafety
 from gateway.learned_file import LearnedFile
 from gateway.link import LinkError, LinkUrl
@@ -49,8 +50,6 @@ from schemas.rights import NO_PEOPLE, People
 from schemas.running_cars import RunningMark
 from schemas.words import Level, Shows
 
-CHECK_INTERVAL_S: Final = 0.2
-"""Interval of the checks for silence, changed states, and a stalled loop."""
 RIVAL_CHECK_DELAY_S: Final = 0.5
 """Delay of the second check for another gateway of the car. By then, both must have declared themselves on the bus
 (docs/reference/keys.md#one-gateway-per-car)."""
@@ -321,8 +320,8 @@ class CarGateway:
         """Check for silence and changed states, and publish the health of the process once a second."""
         next_health = self._loop.time()
         while True:
-            due = self._loop.time() + CHECK_INTERVAL_S
-            await asyncio.sleep(CHECK_INTERVAL_S)
+            due = self._loop.time() + TICK_S
+            await asyncio.sleep(TICK_S)
             now = self._loop.time()
             self._worst_lag_s = max(self._worst_lag_s, now - due)
             self._on_gap(now)
@@ -368,7 +367,7 @@ class CarGateway:
                 self._publisher.on_slept(slept_s)
             self._control.on_sleep(slept_s, now, counted=MONOTONIC_COUNTS_SLEEP)
             self._wake.set()
-        gap_s = now - self._alive_at - CHECK_INTERVAL_S
+        gap_s = now - self._alive_at - TICK_S
         if gap_s > BUS_LOSS_GAP_S:
             self._publisher.on_bus_lost(now)
         self._driver.on_stall(gap_s, now)

@@ -40,6 +40,8 @@ from schemas.words import (
     Verdict,
 )
 
+TICK_S: Final = 0.2
+"""Interval at which a gateway calls `Driver.tick`."""
 STALL_S: Final = 0.5
 """Maximum gap of the loop during a held motion. After a longer one the gateway stops the car
 (docs/explanation/how-it-works.md#processes-and-threads)."""
@@ -343,7 +345,7 @@ class Driver(ABC):
 
     @abstractmethod
     def tick(self, now: float) -> None:
-        """Check for silence. The gateway calls it a few times a second."""
+        """Check for silence. The gateway calls it every `TICK_S`."""
 
     def on_stall(self, gap_s: float, now: float) -> None:
         """Stop a driven car after a gap of the loop."""

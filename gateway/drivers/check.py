@@ -34,7 +34,7 @@ from gateway.control.commands import (
 )
 from gateway.control.control_output import CommandRecord
 from gateway.control.controller import Controller
-from gateway.control.driver import Driver, Event
+from gateway.control.driver import TICK_S, Driver, Event
 from gateway.drivers import BUILT_IN, Family, built_in_platforms
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages
@@ -47,7 +47,6 @@ from schemas.words import CAPABILITIES, Basis, FrameOrigin, Mode, Motion, Motors
 from schemas.words import Light as LightWord
 
 CHECK_STEP_S: Final = 0.02
-TICK_S: Final = 0.2
 FIRST_STOP_S: Final = 1.0
 """Maximum time from a person's stop to its first frame, unless a longer worst case is announced."""
 JOINED_S: Final = 7.0

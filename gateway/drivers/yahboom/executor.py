@@ -11,7 +11,7 @@ from gateway.control.command_log import Pending
 from gateway.control.command_queue import HeldMotion
 from gateway.control.commands import Fan, SetMode
 from gateway.control.control_output import OutgoingFrame
-from gateway.control.driver import Desk, Driver
+from gateway.control.driver import TICK_S, Desk, Driver
 from gateway.control.trust import TrustEvent
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.estimate.learned import blocking_kind
@@ -30,8 +30,8 @@ FREE_ACTIONS: Final = 3
 wait."""
 LISTEN_LIMITS: Final = 2.0
 """Time without a report after which a stream of actions waits for one, in silences that would contradict the mode."""
-NOTICE_S: Final = 0.2
-"""Time within which a silence is noticed: some ticks."""
+NOTICE_S: Final = 2 * TICK_S
+"""Maximum time within which a silence is noticed: the ticks of a busy gateway come late."""
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Time before the end of a drive in which its motion is not repeated. A report of the car takes 43 ms, and if an stm32
 car sends one then, it loses the stop that follows the repeated motion."""
