@@ -1,6 +1,6 @@
 """The fields of a world file. `world_check` checks how the fields fit together. Pure."""
 
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
@@ -53,21 +53,19 @@ class StartEntry(Entry):
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
 
 
+def _place(unless: str, offset: str) -> Any:
+    """Return a coordinate of a thing or a lamp. `unless`: when it may be left out. `offset`: its meaning if carried."""
+    words = f"where it stands, meters, required unless {unless}; if carried, how far {offset}"
+    return Field(default=0.0, description=words)
+
+
 class ThingEntry(Entry):
     """A disc or a box that stands, moves along a path, or is carried by a car."""
 
     # A field whose default means nothing has a default factory, so that the schema for editors shows no default.
     # `world_check` reports fields that are missing or not allowed.
-    x_m: _Place = Field(
-        default=0.0,
-        description="where it stands, meters, required unless it has a path or is carried; if carried, how far ahead "
-        "of the car's middle",
-    )
-    y_m: _Place = Field(
-        default=0.0,
-        description="where it stands, meters, required unless it has a path or is carried; if carried, how far to the "
-        "left of the car's middle",
-    )
+    x_m: _Place = _place("it has a path or is carried", "ahead of the car's middle")
+    y_m: _Place = _place("it has a path or is carried", "to the left of the car's middle")
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
     radius_m: _Size = Field(default_factory=float, description="radius of a disc, meters")
     width_m: _Size = Field(default_factory=float, description="width of a box, meters, instead of `radius_m`")
@@ -89,16 +87,8 @@ class ThingEntry(Entry):
 class LampEntry(Entry):
     """A lamp that the light sensors see, if nothing is in between."""
 
-    x_m: _Place = Field(
-        default=0.0,
-        description="where it stands, meters, required unless it is carried; if carried, how far ahead of its "
-        "carrier's middle",
-    )
-    y_m: _Place = Field(
-        default=0.0,
-        description="where it stands, meters, required unless it is carried; if carried, how far to the left of its "
-        "carrier's middle",
-    )
+    x_m: _Place = _place("it is carried", "ahead of its carrier's middle")
+    y_m: _Place = _place("it is carried", "to the left of its carrier's middle")
     reach_m: float = Field(
         default=1.5, gt=0, le=100, description="distance from which it is seen with brightness 1, meters"
     )

@@ -1,4 +1,4 @@
-"""What commands print: readings as lines or JSON objects, tables, CSV, and progress bars."""
+"""Prints readings as lines or JSON objects, tables, CSV, and progress bars."""
 
 import csv
 import io

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from fleet.hub.addresses import own_addresses, own_names
-from fleet.hub.hub_store import CA_KEY_FILE, HubStore
+from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
@@ -69,8 +69,8 @@ def is_hub_here(endpoint: str) -> bool:
 
 def is_authority_here(ca: bytes) -> bool:
     """Return True if this computer has the key of the authority with this certificate, so that it is its hub."""
-    stores = directory_of(SECURE_ENDPOINT).parent.glob(f"*/{DIRECTORY}/{CA_FILE}")
-    return any(each.read_bytes() == ca for each in stores if (each.parent / CA_KEY_FILE).is_file())
+    found = directory_of(SECURE_ENDPOINT).parent.glob(f"*/{DIRECTORY}/{CA_FILE}")
+    return any(each.read_bytes() == ca and HubStore(Credentials(each.parent, "")).is_hub for each in found)
 
 
 def use(endpoint: str) -> None:
