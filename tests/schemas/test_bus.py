@@ -17,7 +17,7 @@ from schemas import bus, messages, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support import processes
 from tests.support.ports import free_endpoint
-from tests.support.stall_proxy import StallProxy
+from tests.support.tcp_proxy import StallProxy
 
 
 def wait_for(condition: Callable[[], object]) -> None:

@@ -7,8 +7,8 @@ import shutil
 import socket
 import subprocess
 import sys
-import threading
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from tests.support.console import ConsoleProcess
 from tests.support.network_client import NetworkDevice, find_line, first_code, network_port
 from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses
+from tests.support.tcp_proxy import TcpProxy
 
 pytestmark = [
     pytest.mark.soak,
@@ -89,44 +90,28 @@ class Visitor:
         self._popen.stdout.close()
 
 
-class Eavesdropper:
+class Eavesdropper(TcpProxy):
     """An attacker in the network who passes each byte on and records it."""
 
     def __init__(self, host: str, port: int) -> None:
-        self.sent: list[bytes] = []
+        self._sent: dict[int, bytes] = defaultdict(bytes)
+        super().__init__(port, host)
+
+    @property
+    def sent(self) -> list[bytes]:
         """Bytes of each client, by connection."""
-        self._target = host, port
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._sockets = [self._listener]
-        self.port: int = self._listener.getsockname()[1]
-        threading.Thread(target=self._serve, daemon=True).start()
+        return [self._sent[number] for number in range(self.connections)]
 
-    def _serve(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                near, _ = self._listener.accept()
-                far = socket.create_connection(self._target)
-                self._sockets += [near, far]
-                self.sent.append(b"")
-                threading.Thread(target=self._pass, args=(near, far, len(self.sent) - 1), daemon=True).start()
-                threading.Thread(target=self._pass, args=(far, near, None), daemon=True).start()
+    def on_bytes(self, data: bytes, connection: int, *, from_client: bool) -> None:
+        """Record the bytes of a client."""
+        if from_client:
+            self._sent[connection] += data
 
-    def _pass(self, source: socket.socket, sink: socket.socket, number: int | None) -> None:
-        with contextlib.suppress(OSError):
-            while data := source.recv(65536):
-                if number is not None:
-                    self.sent[number] += data
-                sink.sendall(data)
+    def on_end(self, source: socket.socket, sink: socket.socket) -> None:
+        """Close both ends when one has ended."""
         for each in (source, sink):
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        """Close all connections."""
-        for each in self._sockets:
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-            each.close()
 
 
 def replay(host: str, port: int, recorded: bytes) -> bytes:

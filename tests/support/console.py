@@ -17,7 +17,7 @@ from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.ports import free_port
 from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
-from tests.support.stall_proxy import StallProxy
+from tests.support.tcp_proxy import StallProxy
 
 CHROMIUM_NAMES = ("chromium", "chromium-browser", "google-chrome")
 CARS = {"red": "arduino+arm", "blue": "stm32", "green": "raspberry_pi"}

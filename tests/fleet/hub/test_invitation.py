@@ -6,10 +6,12 @@ import resource
 import socket
 import ssl
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from fleet.hub.discovery import announced, hubs_found
 from fleet.hub.hub_store import HubStore
 from fleet.hub.invitation import Invitation, NotJoined, join
 from fleet.hub.join_code import MAX_GUESSES, JoinCode
@@ -18,6 +20,7 @@ from schemas.identity import car, person, site
 from schemas.state_dir import STATE_VARIABLE, directory_of
 from tests.support import in_process
 from tests.support.ports import free_port
+from tests.support.processes import PATIENCE_S
 
 ME = person("ann")
 
@@ -96,15 +99,14 @@ def test_join_on_the_hubs_own_computer_spends_no_code(
     monkeypatch.setenv(STATE_VARIABLE, str(tmp_path))
     own = made(directory_of("tls/127.0.0.1:7447") / "tls")
     opened = Invitation(own, person("mia"), hub_port=7447, address="127.0.0.1", port=free_port(), fleet_file="cars: {}")
-    monkeypatch.setattr("fleet.commands.hub.hubs_found", lambda addresses: [f"127.0.0.1:{opened.port}"])
-    try:
+    # The real search, with more patience: a busy machine answers late.
+    monkeypatch.setattr("fleet.commands.hub.hubs_found", lambda _: hubs_found(["127.0.0.1"], PATIENCE_S))
+    with closing(opened), announced(opened.port, opened.code, ["127.0.0.1"]):
         words = [host.format(port=opened.port)] if host else []
         done = in_process.fleet("join", *words, opened.code, cwd=tmp_path)
         assert (done.returncode, done.stdout) == (1, "")
         assert "still good" in done.stderr
         assert join("127.0.0.1", opened.code, opened.port).identity == person("mia")
-    finally:
-        opened.close()
 
 
 def test_the_right_code_joins_once(invitation: Invitation, store: HubStore) -> None:
