@@ -81,11 +81,11 @@ def test_estop_of_one_car_does_not_stop_the_others(fleet: FleetProcesses) -> Non
     with Client(fleet.endpoint, sender="mia", kind="person") as client:
         (outcome,) = client.estop(["red"], "smoke")
         assert outcome.ok
-        assert client.car("blue").drive("forward").ok
+        client.car("blue").drive("forward").check()
         refused = client.car("red").drive("forward")
         assert (refused.ok, refused.reason) == (False, "estopped")
         assert client.resume(["red"], estops(fleet, "red"))[0].ok
-        assert client.car("red").drive("forward").ok
+        client.car("red").drive("forward").check()
 
 
 def test_next_command_line_does_not_wait_for_lease(fleet: FleetProcesses) -> None:
@@ -127,7 +127,7 @@ def test_a_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
         Client(fleet.endpoint, person="bob", kind="person") as bob,
     ):
         fleet.ready("blue")
-        assert ann.car("blue").drive("forward", 10.0, wait=False).ok
+        ann.car("blue").drive("forward", 10.0, wait=False).check()
         wait_for(lambda: driving(sim, "blue"), "blue drives")
         assert [outcome.reason for outcome in ann.pause()] == ["not_allowed"] * 2
         assert driving(sim, "blue")
@@ -137,14 +137,14 @@ def test_a_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
         refused = bob.car("blue").drive("forward")
         assert refused.reason == "paused"
         assert "(teacher:" in refused.words
-        assert teacher.car("red").drive("forward", 0.2).ok
+        teacher.car("red").drive("forward", 0.2).check()
         assert [outcome.ok for outcome in teacher.unpause()] == [True] * 2
         assert ann.car("blue").drive("forward").reason == "lent"
-        assert bob.car("blue").drive("forward").ok
+        bob.car("blue").drive("forward").check()
         safety = fleet.state("safety", "blue")
         assert (safety.loan.to, safety.loan.rank, list(safety.pauses)) == ("bob", "lead", [])
         assert 500 < safety.loan.expires_in_s < 600
-        assert bob.car("blue").end_loan().ok
+        bob.car("blue").end_loan().check()
         assert bob.car("blue").drive("forward").reason == "not_allowed"
 
 

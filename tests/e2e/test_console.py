@@ -418,7 +418,7 @@ def test_leased_car_is_refused_until_taken(stage: ConsoleStage) -> None:
     assert refused.reason == "leased"
     page.get_by_role("button", name="Give back red").click()
     page.get_by_role("button", name="Take over red").wait_for()
-    assert stage.person.car("red").drive("forward", 0.2).ok
+    stage.person.car("red").drive("forward", 0.2).check()
 
 
 LOST_ON = {

@@ -42,7 +42,7 @@ def sim(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> GatewayProces
     gateway = fleet.gateway(link)
     fleet.ready()
     with Client(fleet.endpoint, sender="mia", kind="person") as person:
-        assert person.car("red").mode("tracking").ok
+        person.car("red").mode("tracking").check()
     wait_for(lambda: driving(sim), "red drives")
     assert gateway.popen.poll() is None
     return sim

@@ -214,7 +214,7 @@ def test_our_own_client_is_who_its_certificate_says(stage: SecureStage) -> None:
     with Client(stage.fleet.endpoint, kind=Rank.PERSON) as ann:
         assert ann.sender.startswith("ann@")
         assert ann.bus.identity == ANN
-        assert ann.car("red").led(1, 2, 3).ok
+        ann.car("red").led(1, 2, 3).check()
         assert all(each.ok for each in ann.stop())
     with pytest.raises(keys.BadKey, match="by the certificate"):
         Client(stage.fleet.endpoint, person="mia")

@@ -32,7 +32,7 @@ def judge(fleet: FleetProcesses) -> Judge:
 
 def drive_by_a_mode(fleet: FleetProcesses, judge: Judge) -> None:
     with Client(fleet.endpoint, sender="mia", kind="person") as person:
-        assert person.car("red").mode("tracking").ok
+        person.car("red").mode("tracking").check()
     wait_for(lambda: judge.driving, "red drives")
 
 

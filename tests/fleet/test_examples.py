@@ -90,7 +90,7 @@ def test_custom_policy(cars: Cars) -> None:
             3,
         )
         assert cars.state("mode").asked == "manual"
-        assert mia.car("red").resume().ok
+        mia.car("red").resume().check()
 
 
 def test_notebook(cars: Cars) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from gateway.control.commands import Action, Drive, SetLight, SetMode, Stop
 from gateway.drivers.yahboom.protocol.frames import ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from gateway.sim.model.traits import CarTraits
 from schemas.words import Light, Mode, Motion, Phase, Verdict
 from tests.support.stops import WORLDS
@@ -96,6 +97,7 @@ class UseEpisode:
         )
         self.use = Use(seed, [], self.car, [])
         self._false_since: float | None = None
+        self._lit_at: float | None = None
 
     def play(self) -> Use:
         """Connect, and send some commands at random moments."""
@@ -124,6 +126,10 @@ class UseEpisode:
         asked_at, count = pair.now, len(pair.records)
         free_at = max(asked_at, control.driver.stops.free_at(asked_at))
         wait_s = control.wait_s(what, asked_at)
+        pacing = control.driver.model.pacing
+        if isinstance(what, SetLight) and not self._has_echo and self._lit_at == pacing.written_at:
+            # An action waits until the car has read the action before it.
+            wait_s = max(wait_s, min(pacing.buffer_until - asked_at, REPEAT_INTERVAL_S))
         if free_at - asked_at > LONGEST_FIRST_FRAMES_S + self._longest_block_s:
             self._violate(f"(5) {what} would wait for {free_at - asked_at:.1f} s")
         self.use.commands.append(f"{asked_at:.2f} {what}")
@@ -205,7 +211,7 @@ class UseEpisode:
         self._stop()
 
     def _light(self) -> None:
-        self._ask(SetLight(Light.RED))
+        self._lit_at = self._ask(SetLight(Light.RED))
 
     def _stop(self) -> None:
         pair = self.pair

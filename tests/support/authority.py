@@ -29,7 +29,7 @@ def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str])
     coordinator = coordinate()
     wait_for(lambda: judge.modes and judge.modes[-1][1] == "tracking", "the coordinator has its mode")
     with Client(fleet.endpoint, sender="mia", kind="person") as person:
-        assert person.car("red").stop().ok
+        person.car("red").stop().check()
     held_ns = time.time_ns()  # not the time of the newest truth: an older one may still be on its way
     for victims in killed:
         if "gateway" in victims:
@@ -51,6 +51,6 @@ def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str])
     moved = judge.on_after(held_ns)
     # After the end of the hold, the coordinator assigns the mode again.
     with Client(fleet.endpoint, sender="mia", kind="person") as person:
-        assert person.car("red").resume().ok
+        person.car("red").resume().check()
     wait_for(lambda: judge.modes[-1][1] == "tracking", "the coordinator has its mode again")
     return moved

@@ -213,6 +213,11 @@ class CarModel:
         """Return the last motion sent, or None if the state is unknown or the car drives by itself."""
         return self.believed.motion if self.known and self.manual else None
 
+    @property
+    def is_without_echo(self) -> bool:
+        """Return True if the last ranging had no echo. A car that has sent no range is not known to have none."""
+        return self.range_cm is None and self.range_at > float("-inf")
+
     def moved_since(self, range_cm: float | None, since: float) -> str:
         """Describe how the distance has changed since a drive began. Empty if no reading shows a change."""
         return "" if self.range_at < since + FLIGHT_S else describe_way(range_cm, self.range_cm)

@@ -142,7 +142,7 @@ class Executor(Driver):
         if (change := self._next_mode) is not None:
             return self._open_mode(change, now)
         pending = None if self._actions_wait(now) else queue.next_part(now)
-        if pending is not None and now >= model.pacing.act_at(pending.next_frame) and self._may_overtake(pending):
+        if pending is not None and now >= self._act_at(pending) and self._may_overtake(pending):
             frame = model.believed.with_motion(pending.next_frame)
             return self._prepare(frame, FrameOrigin.COMMAND, pending, pending)
         if self.stops.running is not None:
@@ -152,6 +152,14 @@ class Executor(Driver):
                 General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None
             )
         return self._renew_stop(now)
+
+    def _act_at(self, pending: Pending) -> float:
+        """Return the earliest time for the next frame of an action on a part of the car."""
+        # Without an echo, the car reads only once in a ranging. If it reads while this frame arrives behind an unread
+        # one, it takes the rest of this frame for the next string, and a digit in it may start the motors.
+        pacing = self.model.pacing
+        follows_action = bool(self._action_times) and self._action_times[-1] == pacing.written_at
+        return pacing.act_at(pending.next_frame, alone=follows_action and self.model.is_without_echo)
 
     @property
     def _next_mode(self) -> Pending | None:
@@ -464,7 +472,7 @@ class Executor(Driver):
         free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
         actions_wait = self._actions_wait(now)
         times.extend(
-            max(each.due_at, model.pacing.act_at(each.next_frame), model.mode_left_by, free_at)
+            max(each.due_at, self._act_at(each), model.mode_left_by, free_at)
             for each in (queue.turns if self._next_mode is None and not actions_wait else ())
             if self._may_overtake(each)
         )

@@ -178,11 +178,12 @@ class Pacing:
             case Gate.ALONE:
                 return self.buffer_until
 
-    def act_at(self, frame: Frame) -> float:
-        """Return the earliest time for the frame of a one-shot."""
+    def act_at(self, frame: Frame, *, alone: bool = False) -> float:
+        """Return the earliest time for the frame of a one-shot, or the earliest at which the car reads it alone."""
         if self.profile.kind is Platform.RASPBERRY_PI and not isinstance(frame, General):
-            return max(self.flight_until, self.buffer_until)  # if it is received with another one, the program dies
-        return max(self.flight_until, self.earliest_named_at(frame))
+            alone = True  # if it is received with another one, the program dies
+        at = max(self.flight_until, self.earliest_named_at(frame))
+        return max(at, self.buffer_until) if alone else at
 
     def open_at(self, now: float, *, can_show: bool) -> float:
         """Return when a mode may be opened."""

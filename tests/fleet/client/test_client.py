@@ -142,7 +142,7 @@ def test_person_stop_holds_car_against_coordinator_until_resume(client: Fleet, c
     client.stop(["green"])
     with Fleet(cars.endpoint, sender="c", kind="coordinator") as coordinator:
         assert coordinator.car("green").mode("manual").reason == "held"
-        assert client.car("green").resume().ok
+        client.car("green").resume().check()
         # The last driver has a lease for two seconds more.
         wait_for(lambda: coordinator.car("green").mode("manual").ok, "the coordinator has it")
 
@@ -151,7 +151,7 @@ def test_client_that_disconnects_while_driving_leaves_no_car_driving(cars: Cars)
     events: list[Any] = []
     cars.bus.subscribe("fleet/blue/event/command", lambda sample: events.append(sample.message()))
     with Fleet(cars.endpoint, sender="gone", kind="script") as client:
-        assert asked(lambda: client.car("blue").drive("forward", LONG_S, wait=False)).ok
+        asked(lambda: client.car("blue").drive("forward", LONG_S, wait=False)).check()
         wait_for(lambda: driving(cars.sim, "blue"), "blue drives")
     wait_for(lambda: not driving(cars.sim, "blue"), "blue stands")
     ended = wait_for(
@@ -447,7 +447,7 @@ def test_reading_a_command_key_is_refused(client: Fleet) -> None:
     began_ns = time.time_ns()
     with pytest.raises(keys.BadKey, match="is a command"):
         client.get("red/@cmd/stop")
-    assert client.car("red").find().ok
+    client.car("red").find().check()
     wait_for(lambda: [each for each in events if each.verb == "find"], "a command that is carried out is recorded")
     # Events of an earlier test's command may arrive late.
     assert {each.verb for each in events if each.stamp.ToNanoseconds() > began_ns} == {"find"}

@@ -79,12 +79,12 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
         # A person stops the car. The coordinator leaves it alone, also if its mode is not the planned one.
-        assert client.car("red").stop().ok
+        client.car("red").stop().check()
         held = lines.until("red", None, "on hold by ann")
         assert held["would_change"].endswith(" (`fleet resume red`)")
         assert client.get("red/state/mode")[0].value.asked == "manual"
         # The hold ends. The coordinator requests the mode again.
-        assert client.car("red").resume().ok
+        client.car("red").resume().check()
         lines.until("red", "tracking", "role tracking")
         wait_for(lambda: truth(cars, "red") == "tracking", "red tracks again")
         # A rule.
@@ -93,7 +93,7 @@ def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> 
         ruled = lines.until("red", "light_seeking", "rule 1")
         assert re.match(r"green/state/motion motion=spin_left \(\d+\.", ruled["readings"][0])
         wait_for(lambda: truth(cars, "red") == "light_seeking", "red seeks light")
-        assert client.car("green").drive("stop").ok
+        client.car("green").drive("stop").check()
         drive.join()
         lines.until("red", "tracking", "role tracking")
         # A gateway comes back. The coordinator brings its car to its mode again.
@@ -344,7 +344,7 @@ def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: 
     Lines(following).until("red", "tracking", "role scout (1 of 1): it had it before")
     # A request of the coordinator would arrive before this stop.
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
-        assert client.car("blue").stop().ok
+        client.car("blue").stop().check()
     Lines(following).until("blue", None, "on hold by ann")
 
     def told() -> list[Any]:
@@ -355,7 +355,7 @@ def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: 
     wait_for(told, "the stop is heard here, too")
     assert {(each.car, each.verb) for each in told()} == {("blue", "stop")}
     with Fleet(cars.endpoint, sender="ann", kind="person") as client:
-        assert client.car("blue").resume().ok
+        client.car("blue").resume().check()
     assert truth(cars, "red") == "tracking"
     assert following.end(signal.SIGTERM) == 0
 

@@ -85,6 +85,17 @@ async def two_frames(car: Stranger) -> None:
     assert car.truth.driving
 
 
+@hazard("two frames in a ranging without an echo, the second cut by its end", echo=False)
+async def cut_by_the_end(car: Stranger) -> None:
+    await awake(car)
+    await car.until(lambda truth: truth.blocked)
+    await car.write(PTZ90 + b"$4WD,PTZ1")
+    await car.wait(1.1)
+    assert not car.truth.driving
+    await car.write(b"61#")
+    await car.until(lambda truth: truth.driving)
+
+
 @hazard("a run, 60 ms, a stop, while the ranging gets no echo", echo=False)
 async def no_echo(car: Stranger) -> None:
     await awake(car)

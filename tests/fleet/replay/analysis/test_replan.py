@@ -86,7 +86,7 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
         # The recording needs the hold. On a busy machine the report that shows the stop may come too late.
         wait_for(lambda: client.car("red").stop().ok, "a shown stop")
         until(first, "red", "alone")
-        assert client.car("red").resume().ok
+        client.car("red").resume().check()
         until(first, "red", "role")
         cars.gateways["blue"].kill()
         until(first, "blue", "alone")
@@ -105,7 +105,7 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
         # The recording needs the hold. On a busy machine the report that shows the stop may come too late.
         wait_for(lambda: client.car("red").stop().ok, "a shown stop")
         until(second, "red", "alone")
-        assert client.car("red").resume().ok
+        client.car("red").resume().check()
         until(second, "red", "role")
         key = "fleet/@coordinator/@cmd/plan"
         answers = list(

@@ -139,6 +139,20 @@ def two_frames(pair: Pair) -> None:
     stops(pair)
 
 
+@ours("two frames in a ranging without an echo, the second cut by its end")
+def cut_by_the_end(pair: Pair) -> None:
+    """Request two servo angles, at moments at which the second frame could arrive as a ranging ends."""
+    for step in range(24):
+        pair.until(lambda: not pair.car.truth.blocked, 3.0)
+        pair.until(lambda: pair.car.truth.blocked, 3.0)
+        pair.run(0.32 + 0.002 * step)
+        pair.ask(AimServo(22))
+        pair.ask(AimServo(161))
+        pair.run(4.0)
+        assert pair.car.truth.servo == 180 - 161, "the second one is obeyed, too"
+    assert len(pair.car.motor_log) == 1, "no change since the beginning"
+
+
 @ours("a run, 60 ms, a stop, while the ranging gets no echo")
 def no_echo(pair: Pair) -> None:
     pair.until(lambda: not pair.car.truth.blocked, 3.0)
