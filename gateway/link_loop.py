@@ -16,7 +16,8 @@ from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Echo, Event, Rejected, TextLine
 from gateway.control.link_health import LinkHealth
 from gateway.control.reconnect_delay import Attempts
-from gateway.link import BaudWatch, Busy, Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link import Busy, Link, LinkError, LinkLost, LinkUrl, open_link
+from gateway.link.baud import BaudWatch
 from gateway.wake import Wake
 from schemas.links import BAUD, SerialUrl, UsbUrl
 from schemas.words import FrameVerdict, Level, LinkState, Motors

@@ -12,14 +12,12 @@ from importlib import import_module
 from typing import Any
 
 from gateway.link.base import Device, Link, LinkKind
-from gateway.link.baud import BaudWatch
 from gateway.link.link_errors import BadUrl, Busy, CannotList, CannotOpen, LinkError, LinkLost
 from gateway.link.url import parse_url
 from schemas.links import LinkUrl
 
 __all__ = [
     "BadUrl",
-    "BaudWatch",
     "Busy",
     "CannotList",
     "CannotOpen",

@@ -2,10 +2,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 
-from gateway.link.serial_ports import SerialPort
 from schemas.links import LinkUrl
+
+if TYPE_CHECKING:
+    from gateway.link.serial_ports import SerialPort
 
 Url = TypeVar("Url", bound=LinkUrl)
 
@@ -70,7 +72,7 @@ class LinkKind(ABC, Generic[Url]):
     async def open(self, url: Url, timeout_s: float, *, first: bool) -> Link:
         """Open the link, or raise CannotOpen. With `first`, go before other cars that wait for the same adapter."""
 
-    def ports(self) -> Sequence[SerialPort]:
+    def ports(self) -> "Sequence[SerialPort]":
         """Return the ports to which one can listen without harm. Raises CannotOpen if the system does not list them."""
         return ()
 

@@ -8,7 +8,7 @@ identity of its sender in its key, so a gateway knows who sent it.
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -106,9 +106,9 @@ class Credentials:
         except OSError:
             return None
 
-    def why_invalid(self, identity: str, now: datetime) -> str:
+    def why_invalid(self, identity: str) -> str:
         """Return why a hub refuses this identity's certificate: it has ended, or not yet begun. Empty if neither."""
-        dates = self.dates(identity)
+        dates, now = self.dates(identity), datetime.now(UTC)
         if dates is None or dates.begins <= now < dates.ends:
             return ""
         begins, ends = dates.begins, dates.ends

@@ -7,7 +7,6 @@ import threading
 import warnings
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import suppress
-from datetime import UTC, datetime
 from math import inf
 from time import monotonic
 from typing import Any, Final, Self
@@ -131,7 +130,7 @@ class Bus:
             try:
                 session = zenoh.open(client_config(where, timeout_s, identity))
             except zenoh.ZError as error:
-                if identity and (why := credentials_of(where).why_invalid(identity, datetime.now(UTC))):
+                if identity and (why := credentials_of(where).why_invalid(identity)):
                     raise BusError(why) from error
                 may_be = f", or refuses the certificate of {identity}" if identity else ""
                 raise BusError(
