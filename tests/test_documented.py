@@ -15,12 +15,11 @@ from fleet.cli import cli
 from fleet.client.diagnosis import CHECKS
 from schemas.commands import COMMANDS
 from schemas.words import Mode, Reason
+from tests.support.sources import PRODUCT, ROOT, nodes, source_files, text
 from tests.tools.pages import files, proto
 from tests.tools.pages.command_line import commands, gateway_parsers, options, shown_action, subcommands
 
-ROOT: Final = Path(__file__).parents[1]
 DOCS: Final = ROOT / "docs"
-PRODUCT: Final = ("gateway", "fleet", "schemas")
 SHELL: Final = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 FILE_BLOCK: Final = re.compile(r'^```yaml title="(fleet|plan|world)\.yaml"\n(.*?)^```', re.MULTILINE | re.DOTALL)
 NO_EXAMPLE: Final = frozenset({"down", "status", "reload", "whistle"})
@@ -30,12 +29,6 @@ OURS: Final = re.compile(r"FLEET_\w+|_FLEET_COMPLETE")
 
 def read(page: str) -> str:
     return (ROOT / page).read_text(encoding="utf-8")
-
-
-def product_trees() -> Iterator[tuple[Path, ast.Module]]:
-    for package in PRODUCT:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            yield path, ast.parse(path.read_text(encoding="utf-8"))
 
 
 LEAVES: Final = [each for name, command in commands() for each in subcommands(name, command)]
@@ -161,17 +154,17 @@ def test_each_verb_and_each_mode_is_documented() -> None:
 
 def log_codes() -> Iterator[str]:
     """Yield the code of each event that a gateway logs: the argument after the level."""
-    for path, tree in product_trees():
-        if path.relative_to(ROOT).parts[0] != "gateway":
+    for path in source_files("gateway"):
+        if "Level." not in text(path):
             continue
-        for node in ast.walk(tree):
+        for node in nodes(path):
             if isinstance(node, ast.Call) and len(node.args) >= 3 and "Level." in ast.unparse(node.args[0]):
                 code = node.args[1]
                 if isinstance(code, ast.Constant) and isinstance(code.value, str):
                     yield code.value
                 elif isinstance(code, ast.JoinedStr):  # f"battery_{level}"
                     yield ast.unparse(code)[2:-1].partition("{")[0]
-        for node in ast.walk(tree):
+        for node in nodes(path):
             if isinstance(node, ast.Call) and "severity.get" in ast.unparse(node.args[0] if node.args else node.func):
                 yield ast.unparse(node.args[1])[2:-1].partition("{")[0]
 
@@ -187,9 +180,10 @@ def test_each_event_is_documented() -> None:
 
 def environment_variables() -> Iterator[str]:
     """Yield each variable that the code reads, and each of the fleet's own variables that the code names."""
-    for _, tree in product_trees():
-        for node in ast.walk(tree):
-            words = ast.unparse(node) if isinstance(node, ast.Call | ast.Subscript) else ""
+    for path in source_files(*PRODUCT):
+        reads = "os." in text(path)
+        for node in nodes(path):
+            words = ast.unparse(node) if reads and isinstance(node, ast.Call | ast.Subscript) else ""
             if found := re.match(r"os\.(?:environ(?:\.get\(|\.setdefault\(|\[)|getenv\()'(\w+)'", words):
                 yield found[1]
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and OURS.fullmatch(node.value):

@@ -2,41 +2,22 @@
 
 import ast
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
 
 from tests.support.message_length import MAX_LINES, count_lines
+from tests.support.sources import GROUP, PACKAGES, PRODUCT, ROOT, nodes, parsed, source_files
 
-pytestmark = pytest.mark.xdist_group("sources")  # on one worker, which parses each file once
-
-ROOT = Path(__file__).resolve().parents[1]
-PRODUCT = ("gateway", "fleet", "schemas")
-PACKAGES = (*PRODUCT, "tests")
-GENERATED = ROOT / "schemas" / "gen"
+pytestmark = pytest.mark.xdist_group(GROUP)
 
 TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
 """Classes of the SDK that have an asyncio twin of the same name in fleet/aio.py."""
 
 LAZY_IMPORTS = 143
 """Maximum number of imports inside functions. Each of them shortens the start of a command line."""
-
-
-def source_files(*packages: str) -> Iterator[Path]:
-    for package in packages:
-        yield from (path for path in sorted((ROOT / package).rglob("*.py")) if GENERATED not in path.parents)
-
-
-@cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-@cache
-def nodes(path: Path) -> tuple[ast.AST, ...]:
-    return tuple(ast.walk(parsed(path)))
 
 
 def module_name(path: Path) -> str:
@@ -79,18 +60,21 @@ def test_constants_of_one_name_have_one_value() -> None:
     assert {name: where for name, where in values.items() if len(set(where.values())) > 1} == {}
 
 
-def imports(path: Path, *, lazy: bool) -> Iterator[ast.Import | ast.ImportFrom]:
-    """Yield the imports at a module's top, or those inside functions. Skip imports for type checkers."""
-    tree = parsed(path)
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+@cache
+def imports(path: Path, *, lazy: bool) -> tuple[ast.Import | ast.ImportFrom, ...]:
+    """Return the imports at a module's top, or those inside functions. Skip imports for type checkers."""
+    found = [node for node in nodes(path) if isinstance(node, ast.Import | ast.ImportFrom)]
+    functions = [node for node in nodes(path) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     typing_only = [
-        node for node in ast.walk(tree) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        node for node in nodes(path) if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
     ]
-    inside = {id(node) for function in functions for node in ast.walk(function)}
-    left_out = {id(node) for block in typing_only for node in ast.walk(block)}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import | ast.ImportFrom) and id(node) not in left_out and (id(node) in inside) == lazy:
-            yield node
+    inside, left_out = lines_of(functions), lines_of(typing_only)
+    return tuple(node for node in found if node.lineno not in left_out and (node.lineno in inside) == lazy)
+
+
+def lines_of(blocks: Iterable[ast.stmt]) -> set[int]:
+    """Return the numbers of all lines of these statements."""
+    return {line for block in blocks for line in range(block.lineno, (block.end_lineno or block.lineno) + 1)}
 
 
 def imported(path: Path) -> Iterator[str]:
@@ -134,10 +118,10 @@ def test_no_more_imports_are_lazy() -> None:
     assert len(lazy) <= LAZY_IMPORTS, "\n".join(lazy)
 
 
-def messages_with_lines(tree: ast.Module) -> Iterator[tuple[int, str]]:
+def messages_with_lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield line and text of all strings but docstrings and help. A value in a text counts as 12 letters."""
     no_message: set[int] = set()
-    for node in ast.walk(tree):
+    for node in nodes(path):
         if isinstance(node, ast.Expr) or (isinstance(node, ast.keyword) and node.arg in ("epilog", "help")):
             no_message |= {
                 id(each) for each in ast.walk(node.value) if isinstance(node, ast.keyword) or each is node.value
@@ -161,7 +145,7 @@ def test_a_message_to_users_has_at_most_two_lines() -> None:
     raised = ("ClickException", "UsageError", "BadParameter", ".fail", ".echo", "stderr.write")
     faults = []
     for path in source_files(*PRODUCT):
-        for line, text in messages_with_lines(parsed(path)):
+        for line, text in messages_with_lines(path):
             if "\n" not in text and count_lines(text) > MAX_LINES:
                 faults.append(f"{path}:{line}: {text}")
         for node in nodes(path):

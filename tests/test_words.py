@@ -9,7 +9,7 @@ from typing import Final
 import pytest
 
 from schemas import commands, words
-from tests.test_style import ROOT, nodes, source_files
+from tests.support.sources import ROOT, nodes, source_files
 
 pytestmark = pytest.mark.xdist_group("sources")
 

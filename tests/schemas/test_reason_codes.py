@@ -3,48 +3,47 @@
 import ast
 import re
 from collections.abc import Iterator
-from pathlib import Path
+from itertools import chain
 from typing import Final
+
+import pytest
 
 from schemas.reason_codes import EVENTS, REASONS
 from schemas.words import BatteryLevel, Level, Reason
+from tests.support.sources import GROUP, PRODUCT, ROOT, nodes, source_files
 
-ROOT: Final = Path(__file__).parent.parent.parent
+pytestmark = pytest.mark.xdist_group(GROUP)
+
 PAGE: Final = ROOT / "docs/how-to/troubleshooting.md"
 
 
-def trees() -> Iterator[ast.Module]:
-    for package in ("gateway", "fleet", "schemas"):
-        for file in sorted((ROOT / package).rglob("*.py")):
-            if "gen" not in file.parts:
-                yield ast.parse(file.read_text(encoding="utf-8"))
+def product_nodes() -> Iterator[ast.AST]:
+    return chain.from_iterable(nodes(path) for path in source_files(*PRODUCT))
 
 
 def logged() -> set[tuple[str, str]]:
     """Return level and code of each call `log(Level.X, "code", ...)`."""
     found = set()
-    for tree in trees():
-        for node in ast.walk(tree):
-            match node:
-                case ast.Call(func=ast.Attribute(attr="log"), args=[ast.Attribute(attr=level), ast.Constant(code), *_]):
-                    found.add((str(Level[level]), str(code)))
+    for node in product_nodes():
+        match node:
+            case ast.Call(func=ast.Attribute(attr="log"), args=[ast.Attribute(attr=level), ast.Constant(code), *_]):
+                found.add((str(Level[level]), str(code)))
     return found
 
 
 def templates() -> list[re.Pattern[str]]:
     """Return a pattern for each text of 3 to 59 words in the source."""
     found = []
-    for tree in trees():
-        for node in ast.walk(tree):
-            match node:
-                case ast.JoinedStr(values=values):
-                    text = "".join(str(each.value) if isinstance(each, ast.Constant) else "{}" for each in values)
-                case ast.Constant(value=str() as text):
-                    pass
-                case _:
-                    continue
-            if 3 <= len(text.split()) < 60:
-                found.append(re.compile(".+?".join(re.escape(each) for each in re.split(r"\{\w*\}", text.rstrip()))))
+    for node in product_nodes():
+        match node:
+            case ast.JoinedStr(values=values):
+                text = "".join(str(each.value) if isinstance(each, ast.Constant) else "{}" for each in values)
+            case ast.Constant(value=str() as text):
+                pass
+            case _:
+                continue
+        if 3 <= len(text.split()) < 60:
+            found.append(re.compile(".+?".join(re.escape(each) for each in re.split(r"\{\w*\}", text.rstrip()))))
     return found
 
 
@@ -53,9 +52,10 @@ def test_each_reason_is_in_the_table() -> None:
 
 
 def test_each_event_is_in_the_table_with_its_level() -> None:
-    assert logged() <= {(each.level, code) for code, each in EVENTS.items()}
+    found = logged()
+    assert found <= {(each.level, code) for code, each in EVENTS.items()}
     elsewhere = {f"battery_{level}" for level in BatteryLevel} | {"internal_error"}
-    assert set(EVENTS) == {code for _, code in logged()} | elsewhere
+    assert set(EVENTS) == {code for _, code in found} | elsewhere
 
 
 def test_each_code_has_a_section_that_says_what_to_do() -> None:
