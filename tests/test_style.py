@@ -16,7 +16,7 @@ pytestmark = pytest.mark.xdist_group(GROUP)
 TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
 """Classes of the SDK that have an asyncio twin of the same name in fleet/aio.py."""
 
-LAZY_IMPORTS = 143
+LAZY_IMPORTS = 142
 """Maximum number of imports inside functions. Each of them shortens the start of a command line."""
 
 
