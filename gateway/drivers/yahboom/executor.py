@@ -210,7 +210,8 @@ class Executor(Driver):
 
     def _actions_wait(self, now: float) -> bool:
         """Return True if actions on parts of the car wait, because a stream of them is in the way of something else."""
-        return self._stop_goes_first(now) or self._renewal_goes_first(now) or self._is_listening(now)
+        waits = bool(self.queue.one_shots)
+        return waits and (self._stop_goes_first(now) or self._renewal_goes_first(now) or self._is_listening(now))
 
     def _renewal_goes_first(self, now: float) -> bool:
         """Return True if a stream of actions has held up the renewal of a stop that the car has not shown."""
