@@ -340,24 +340,28 @@ def _describe_cars_on(endpoint: str, within_s: float) -> str:
 def _stop_first(endpoint: str, car: str) -> None:
     """Stop a car whose gateway is about to lose its certificate: nobody reaches it over the bus after that.
 
-    The hub may be restarting just now, because its own certificate or its rules have changed. So wait for the car.
+    The hub may be restarting just now, because its own certificate or its rules have changed. So try for a while.
     """
     deadline = time.monotonic() + HUB_RESTART_S
+    while not _try_to_stop(endpoint, car, is_last=time.monotonic() > deadline):
+        time.sleep(0.1)
+
+
+def _try_to_stop(endpoint: str, car: str, *, is_last: bool) -> bool:
+    """Try to stop a car that is on, and say how that went. Return False, and say nothing, if another try is due."""
     try:
         with Fleet(endpoint, kind=Rank.PERSON) as client:
-            while car not in client.cars():
-                if time.monotonic() > deadline:
-                    return
-                time.sleep(0.1)
-            while not (outcome := client.car(car).stop()).ok and time.monotonic() < deadline:
-                time.sleep(0.1)
+            outcome = client.car(car).stop() if car in client.cars() else None
     except BusError as error:
-        click.echo(f"{car} was not stopped: {error}", err=True)
-        return
-    if outcome.ok:
+        if is_last:
+            click.echo(f"{car} was not stopped: {error}", err=True)
+        return is_last
+    if outcome is not None and outcome.ok:
         click.echo(f"{car} was stopped first, because its gateway loses the bus now.", err=True)
-    else:
+        return True
+    if outcome is not None and is_last:
         click.echo(f"NOT STOPPED: {car}: {outcome.words} Its gateway loses the bus now: go to the car.", err=True)
+    return is_last
 
 
 def _own_store(endpoint: str) -> HubStore:
