@@ -15,7 +15,7 @@ def test_random_cars_are_usable_whatever_they_show(part: int) -> None:
     assert sum(len(use.commands) for use in uses) > 4 * EPISODES
 
 
-@pytest.mark.parametrize("seed", [38195, 40198])
+@pytest.mark.parametrize("seed", [1356, 38195, 40198])
 def test_usability_regression_seeds(seed: int) -> None:
     """Cars that report by a timer, and block. A recovery began in the block of the `MODE00` before it."""
     assert not play(seed).violations
