@@ -27,7 +27,7 @@ from fleet.client.reading import Reading
 from schemas import bus, keys, messages
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import signals
-from schemas.process.ending import end
+from schemas.process.children import OWN_GROUP, end, wait
 from schemas.process.parent import parent_option
 from schemas.suggestion import how_to_install
 from schemas.words import Basis, LinkState, Mode, Motion, Motors, Platform, Rank, Verdict
@@ -378,7 +378,7 @@ def _replay(run: Demo, session: Path, recorded: Counter[str]) -> Path | None:
 
 @contextmanager
 def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[subprocess.Popen[str]]":
-    """Run a process in its own group. So Ctrl-C at the terminal reaches only us, and we end the processes in order."""
+    """Run a process. At the end of the block, end it and print its last lines if it failed."""
     environment = os.environ | {"FLEET_STATE_DIR": str(run.folder / ".state")}
     process = subprocess.Popen(
         [sys.executable, "-m", module, *arguments],
@@ -387,7 +387,7 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
-        process_group=0 if os.name == "posix" else None,
+        process_group=OWN_GROUP,
     )
     last_lines: deque[str] = deque(maxlen=3)
     assert process.stderr is not None
@@ -441,11 +441,7 @@ def _line(process: "subprocess.Popen[str]", name: str) -> dict[str, Any]:
 
 
 def _ended(process: "subprocess.Popen[str]") -> int | None:
-    """Return the exit code, or None if the process still runs after the timeout."""
-    try:
-        return process.wait(PROCESS_EXIT_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        return None
+    return wait(process, PROCESS_EXIT_TIMEOUT_S)
 
 
 def _ask(process: "subprocess.Popen[str]", request: dict[str, object]) -> dict[str, Any]:

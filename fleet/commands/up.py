@@ -32,6 +32,7 @@ from schemas import keys
 from schemas.bus import ENDPOINT_VARIABLE, accepts, check_listening, is_secure, resolve_endpoint
 from schemas.local_time import clock
 from schemas.process import signals, startup, stdio
+from schemas.process.children import leave, start_detached
 from schemas.yaml_document.document import read_text
 
 DEFAULT_FILE: Final = Path("fleet.yaml")
@@ -215,23 +216,14 @@ def _run_detached(arguments: Iterable[str], *, as_json: bool) -> int:
     """Run `fleet up` in a process of its own until its start has ended. Return the exit code."""
     command = [sys.executable, "-m", "fleet.cli", "up", *arguments, "--detached"]
     with signals.held_back():
-        child = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=os.name == "posix",  # closing the terminal must not end the child
-            creationflags=getattr(subprocess, "DETACHED_PROCESS", 0)
-            | getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
-        )
+        child = start_detached(command, output=subprocess.PIPE)
     try:
         code = _follow_start(child, as_json=as_json)
     except KeyboardInterrupt:
         child.terminate()  # the child stops every car first
         _follow_start(child, as_json=as_json)
         raise SystemExit(startup.INTERRUPTED) from None
-    child.returncode = child.poll() or 0  # the child outlives this process, so prevent a warning
+    leave(child)
     return code
 
 

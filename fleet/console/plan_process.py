@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from fleet.aio import Fleet
+from schemas.process.children import kill
 from schemas.process.parent import parent_option
 
 _START_S: Final = 20.0
@@ -67,5 +68,5 @@ class PlanProcess:
         try:
             await asyncio.wait_for(process.wait(), _END_S)
         except TimeoutError:
-            process.kill()
+            kill(process)
             await process.wait()

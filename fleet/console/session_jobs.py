@@ -12,7 +12,7 @@ from typing import Final
 from starlette.requests import Request
 
 from fleet.console.request_filter import PERSON
-from schemas.process.ending import kill
+from schemas.process.children import kill
 
 MAX_SESSION_JOBS: Final = 2
 """Maximum number of processes at work. More requests wait."""

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable
 from typing import Any, Final
 
-from schemas.process.ending import kill
+from schemas.process.children import kill
 
 NICENESS: Final = 10
 """The console, the gateways and the recorder go first."""

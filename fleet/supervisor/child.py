@@ -1,8 +1,4 @@
-"""One child process, its log file of limited size, and the directory of a run.
-
-Each child has its own process group. So Ctrl-C at the terminal reaches only the supervisor, which ends the children in
-order.
-"""
+"""One child process, its log file of limited size, and the directory of a run."""
 
 import asyncio
 import contextlib
@@ -20,7 +16,7 @@ from typing import Final
 
 from schemas.atomic_file import write_atomically
 from schemas.process import json_log
-from schemas.process.ending import kill
+from schemas.process.children import OWN_GROUP, kill
 from schemas.state_dir import directory_of
 
 MAX_LOG_BYTES: Final = 1_000_000
@@ -128,7 +124,7 @@ class Child:
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             env=dict(environment),
-            process_group=0 if os.name == "posix" else None,
+            process_group=OWN_GROUP,
         )
         child = cls(process, log)
         child.task = asyncio.ensure_future(child._follow(on_line, on_exit))

@@ -11,7 +11,7 @@ from typing import Final
 
 from fleet.client.client import Fleet
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
-from schemas.process.ending import end
+from schemas.process.children import OWN_GROUP, end
 from schemas.process.parent import parent_option
 from schemas.words import Motors
 
@@ -29,9 +29,7 @@ def temporary_gateway(client: Fleet, name: str, link: str, on_error: Callable[[s
     with tempfile.TemporaryDirectory() as directory, (Path(directory) / "log").open("w+", encoding="utf-8") as log:
         command = [sys.executable, "-m", "gateway.cli", "run", "--car", name, "--link", link, *parent_option()]
         command += ["--fleet", client.name, "--connect", client.bus.endpoint, "--state-dir", directory]
-        # The gateway runs in its own session, so that Ctrl-C at the terminal reaches only us. Then we let it stop its
-        # car.
-        gateway = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        gateway = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, process_group=OWN_GROUP)
         try:
             yield name if _is_ready(client, name, gateway, log.name, on_error) else None
         finally:

@@ -1,6 +1,5 @@
 """Endpoints, Zenoh configurations, and the start of a missing hub."""
 
-import contextlib
 import json
 import os
 import re
@@ -156,23 +155,14 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
             "there (or `fleet up --insecure-lan`), or give another address with --connect.",
             endpoint,
         )
-    import subprocess
+    from schemas.process.children import leave, start_detached, wait
 
-    command = [sys.executable, "-m", "schemas.bus.hub", "--endpoint", endpoint]
-    hub = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    hub = start_detached([sys.executable, "-m", "schemas.bus.hub", "--endpoint", endpoint])
     deadline = time.monotonic() + timeout_s
     while not accepts(endpoint):
         if time.monotonic() > deadline:
             raise BusError(f"No hub came up at {endpoint} within {timeout_s:g} s. Does another program use the port?")
         # If two hubs start at once, one of them cannot listen and ends. The other one listens in a moment.
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            hub.wait(0.02)
+        if wait(hub, 0.02) is not None:
             time.sleep(0.02)
-    # Nobody waits for the hub. Without this line, the interpreter warns that it is still running.
-    hub.returncode = 0 if hub.returncode is None else hub.returncode
+    leave(hub)

@@ -12,6 +12,8 @@ import threading
 from types import FrameType
 from typing import Final
 
+from schemas.process.children import end
+
 PROGRAM_EXIT_TIMEOUT_S: Final = 3.0
 
 
@@ -21,20 +23,16 @@ def main() -> int:
     sys.stdout.write(f"{child.pid}\n")
     sys.stdout.flush()
 
-    def end(_number: int, _frame: FrameType | None) -> None:
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
         child.terminate()
 
     def watch() -> None:
         while os.read(sys.stdin.fileno(), 64):
             pass
-        child.terminate()
-        try:
-            child.wait(PROGRAM_EXIT_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
+        end(child, PROGRAM_EXIT_TIMEOUT_S)
 
-    signal.signal(signal.SIGTERM, end)
-    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
     threading.Thread(target=watch, daemon=True).start()
     return child.wait()
 

@@ -13,6 +13,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Self
 
+from schemas.process.children import OWN_GROUP, wait
+
 VIEWER_HOST: Final = "127.0.0.1"
 VIEWER_START_TIMEOUT_S: Final = 30.0
 VIEWER_POLL_INTERVAL_S: Final = 0.05
@@ -59,15 +61,13 @@ class Viewer:
             VIEWER_HOST,
             *arguments,
         ]
-        # The viewer is in its own process group. So Ctrl-C at the terminal reaches only us, and we end it after pending
-        # work.
         self._guard = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._stderr,
             env={**environment(), **extra},
-            process_group=0 if os.name == "posix" else None,
+            process_group=OWN_GROUP,
         )
         assert self._guard.stdout is not None
         self.pid = int(self._guard.stdout.readline() or 0)
@@ -89,10 +89,7 @@ class Viewer:
 
         Return the exit code, or None if it is still open after `seconds`.
         """
-        try:
-            return self._guard.wait(seconds)
-        except subprocess.TimeoutExpired:
-            return None
+        return wait(self._guard, seconds)
 
     def wait_until_it_listens(self, port: int) -> None:
         """Wait until the viewer accepts data at this port. Raises NoViewer if it does not."""
