@@ -6,14 +6,17 @@
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import OUTCOME_MARGIN_S, LeaseLost, NotCarriedOut, Outcome
 from fleet.client.reading import Reading
+from fleet.policy.denial_words import describe
 from schemas import keys, messages
 from schemas.bus import Bus, BusError, Sample
+from schemas.rights import Authority, Denial, Hold, Right, Sender, rank_of
 from schemas.words import Motion, Phase, Reason
 
 C_co = TypeVar("C_co", covariant=True)
@@ -32,13 +35,13 @@ class LeaseMonitor:
     A lost lease stays lost.
     """
 
-    def __init__(self, car: str, sender: str) -> None:
+    def __init__(self, car: str, sender: Sender) -> None:
         self.lost = ""
         """Words about who took or stopped the car. Empty while the lease is valid."""
         self._car = car
         self._sender = sender
         self._begun = False
-        self._hold: tuple[str, int] | None = None
+        self._hold: Hold | None = None
         self._newest = ("", 0)
         """The gateway's boot id and the sequence number of the newest message."""
 
@@ -48,19 +51,26 @@ class LeaseMonitor:
         if boot_id and safety.boot_id == boot_id and safety.seq <= seq:
             return
         self._newest = (safety.boot_id, safety.seq)
-        hold = (safety.hold.by, safety.hold.since.ToNanoseconds()) if safety.HasField("hold") else None
-        holder = safety.lease.holder
+        authority, ours = Authority.of(safety), self._sender.name
+        hold, lease = authority.hold, authority.lease
         if not self._begun:  # changes before our lease do not count
-            self._begun = holder == self._sender
+            self._begun = lease is not None and lease.by == ours
         elif self.lost:
             return
-        elif holder not in ("", self._sender):
-            self.lost = f"{self._car} was taken by {_other(holder, self._sender)} ({safety.lease.kind})"
-        elif safety.estops:
-            self.lost = f"{self._car} was e-stopped by {keys.name_of(safety.estops[0].by)}"
-        elif hold not in (None, self._hold) and safety.hold.by != self._sender:
-            self.lost = f"{self._car} was stopped by {_other(safety.hold.by, self._sender)}"
+        elif lease is not None and lease.by != ours:
+            self.lost = f"{self._car} was taken by {_other(lease.by, ours)} ({lease.holder.kind})"
+        elif authority.estops:
+            self.lost = f"{self._car} was e-stopped by {keys.name_of(authority.estops[0].by)}"
+        elif hold is not None and hold != self._hold and hold.by != ours:
+            self.lost = f"{self._car} was stopped by {_other(hold.by, ours)}"
+        elif denial := self._denial(authority):
+            self.lost = describe(denial, self._sender, authority.people, self._car)
         self._hold = hold
+
+    def _denial(self, authority: Authority) -> Denial | None:
+        """Return why a pause, a loan or the people of the fleet keep us from the car."""
+        # A hold may be older than our lease, and then it has ended nothing.
+        return replace(authority, hold=None).may(authority.people.ranked(self._sender), Right.ACT)
 
     def on_outcome(self, outcome: Outcome) -> None:
         """Handle the outcome of a command of ours."""
@@ -79,6 +89,7 @@ class LeasingFleet(Protocol):
 
     name: str
     sender: str
+    kind: str
     bus: Bus
 
     def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
@@ -99,7 +110,7 @@ class Lease(Generic[C_co]):
         self._name = name
         self._leased = leased
         self._take = take
-        self._monitor = LeaseMonitor(name, fleet.sender)
+        self._monitor = LeaseMonitor(name, Sender(fleet.sender, rank_of(fleet.kind)))
         self._monitor_lock = threading.Lock()
         self._over = threading.Event()
         self._undeclare: Any = lambda: None

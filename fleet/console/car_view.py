@@ -16,7 +16,7 @@ from fleet.console.frame_log import describe_gateway
 from fleet.console.page_requests import MAX_CARS
 from fleet.supervisor.temporary_gateway import TEMPORARY_PREFIX
 from schemas import keys, messages, topics
-from schemas.rights import Authority, People, binding_pause
+from schemas.rights import Authority, People, PersonRole, binding_pause
 from schemas.words import UNKNOWN, Level, LinkState, Verdict
 
 TREND_WINDOW_S: Final = 240.0
@@ -367,9 +367,10 @@ class FleetView:
         found = [car.authority.people for car in self._cars.values() if car.names_people]
         return People.merged(found) if found else None
 
-    def leads_of(self, cars: Iterable[str]) -> frozenset[str]:
-        """Return the persons whom the gateways of all these cars know as leads."""
-        return frozenset.intersection(*(frozenset(self.look_up(car).authority.people.leads) for car in cars))
+    def people_of(self, cars: Iterable[str]) -> People:
+        """Return the people of all these cars: whoever is a lead of each of them is a lead."""
+        leads = (set(self.look_up(car).authority.people.leads) for car in cars)
+        return People(dict.fromkeys(set.intersection(*leads), PersonRole.LEAD))
 
     @property
     def authority(self) -> dict[str, Authority]:

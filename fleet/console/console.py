@@ -541,7 +541,7 @@ class Console:
             self._merge_stop(("cars", *who), partial(self._stop_cars, page.operator, request, who))
             return
         if request.verb == Verb.MODE:
-            theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.leads_of(cars))
+            theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.people_of(cars))
             self._end_all(theirs, "The car is in a mode.")
         self._count(page, page.operator.command(request, cars, answer))
 
@@ -582,7 +582,7 @@ class Console:
                 message.number("n"),
                 now,
                 person=person,
-                leads=self._view.leads_of(cars),
+                people=self._view.people_of(cars),
             )
         except PressRefused as error:
             page.answer(t="over", press=press_id, words=str(error))

@@ -3,11 +3,13 @@
 The server numbers its ticks. While the finger is down, the page echoes each tick with the id of its press.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 from schemas.limits import STREAM_PAUSE_S
+from schemas.rights import NO_PEOPLE, LeaseState, People, Sender
+from schemas.words import Rank
 
 TICK_INTERVAL_S: Final = 0.1
 """Interval of ticks."""
@@ -39,6 +41,11 @@ class HeldPress:
     motion: str
     last_echo_at: float
     person: str = ""
+
+    @property
+    def sender(self) -> Sender:
+        """Return the page as a sender: two pages of one person are two senders."""
+        return Sender(f"{self.person}@{self.client}", Rank.PERSON)
 
 
 class PressBook:
@@ -73,13 +80,13 @@ class PressBook:
         now: float,
         *,
         person: str = "",
-        leads: Collection[str] = (),
+        people: People = NO_PEOPLE,
     ) -> tuple[HeldPress, list[HeldPress]]:
         """Begin a press. It replaces the page's earlier press. Raises PressRefused.
 
         Return the press, and the presses of other pages that it ends, because a lead takes cars from persons who are
         not leads. An id counts once: a press that is over never begins again, not even by a late message. person: the
-        person at the page. leads: the persons who are leads for all of these cars.
+        person at the page. people: those of all these cars.
         """
         if press_id <= self._newest_ids.get(client, -1):
             raise PressRefused("This press is over. Press again.")
@@ -89,13 +96,14 @@ class PressBook:
         if now - self._stopped_at < AFTER_STOP_S:
             raise PressRefused("The cars were stopped just now. Press again.")
         taken = [other for other in self._presses.values() if other.client != client and set(cars) & set(other.cars)]
+        press = HeldPress(client, press_id, cars, motion, now, person)
         for other in taken:
-            if not _outranks(person, other, leads):
+            if not _may_take(press.sender, other, people):
                 shared = " and ".join(sorted(set(cars) & set(other.cars)))
                 raise PressRefused(f"{_driver(other, person)} drives {shared}.")
         for other in taken:
             del self._presses[other.client]
-        press = self._presses[client] = HeldPress(client, press_id, cars, motion, now, person)
+        self._presses[client] = press
         return press, taken
 
     def echo(self, client: int, press_id: int, tick: int, now: float) -> HeldPress | None:
@@ -146,13 +154,14 @@ class PressBook:
         """End every press of these cars, because they were stopped."""
         return self._end(lambda press: bool(cars & set(press.cars)))
 
-    def drop_cars_of(self, cars: set[str], person: str, leads: Collection[str] = ()) -> list[HeldPress]:
+    def drop_cars_of(self, cars: set[str], person: str, people: People = NO_PEOPLE) -> list[HeldPress]:
         """End the presses of these cars that a person may end by other commands than a stop.
 
         These are the person's own presses. A lead of the cars also ends the presses of persons who are not leads.
         """
+        sender = Sender(person, Rank.PERSON)
         return self._end(
-            lambda press: bool(cars & set(press.cars)) and (press.person == person or _outranks(person, press, leads))
+            lambda press: bool(cars & set(press.cars)) and (press.person == person or _may_take(sender, press, people))
         )
 
     def current(self, client: int) -> HeldPress | None:
@@ -169,8 +178,9 @@ class PressBook:
         return over
 
 
-def _outranks(person: str, press: HeldPress, leads: Collection[str]) -> bool:
-    return person in leads and press.person not in leads
+def _may_take(sender: Sender, press: HeldPress, people: People) -> bool:
+    """Return True if the sender may take the cars of a press. While it lives, it is a lease of the gateways."""
+    return not LeaseState(people.ranked(press.sender)).refuses(people.ranked(sender), take=False)
 
 
 def _driver(press: HeldPress, person: str) -> str:

@@ -15,8 +15,10 @@ from fleet.client.client import Car
 from fleet.client.lease import LeaseMonitor
 from fleet.client.outcome import Outcome
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.rights import Sender
 from tests.fleet.conftest import Cars, asked
 from tests.support.processes import LONG_S, driving, freeze, wait_for
+from tests.support.text_parts import has_parts
 
 # ---------------------------------------------------------------- the state of a lease
 
@@ -51,26 +53,59 @@ def safety(holder: str = "", *, hold: str = "", since_s: int = 1, estop: str = "
     ],
 )
 def test_lease_monitor_detects_loss_from_safety_messages(heard: list[pb.Safety], lost: str) -> None:
-    ours = LeaseMonitor("red", "bot")
+    ours = LeaseMonitor("red", Sender("bot"))
     for message in heard:
         ours.on_safety(message)
     assert ours.lost == lost
 
 
+def paused(message: pb.Safety) -> pb.Safety:
+    message.pauses.add(id="p", by="mia", why="lunch")
+    return message
+
+
+def lent(message: pb.Safety, to: str) -> pb.Safety:
+    message.loan.to, message.loan.by = to, "mia"
+    return message
+
+
+def listed(message: pb.Safety) -> pb.Safety:
+    message.people.drivers.append("bob")
+    return message
+
+
+@pytest.mark.parametrize(
+    ("now", "lost"),
+    [
+        (paused(safety("bot")), "paused … mia: lunch"),
+        (paused(safety()), "paused … mia: lunch"),  # the pause has ended the lease
+        (lent(safety("bot"), "bob"), "red … lent to bob"),
+        (lent(safety("bot"), "bot"), ""),
+        (listed(safety("bot")), "bot … list"),
+    ],
+)
+def test_lease_monitor_detects_what_keeps_sender_from_car(now: pb.Safety, lost: str) -> None:
+    ours = LeaseMonitor("red", Sender("bot"))
+    ours.on_safety(safety("bot"))
+    ours.on_safety(now)
+    assert has_parts(ours.lost, lost)
+    assert bool(ours.lost) is bool(lost)
+
+
 def test_second_program_of_same_person_is_told_apart() -> None:
-    ours = LeaseMonitor("red", "bot@laptop-17")
+    ours = LeaseMonitor("red", Sender("bot@laptop-17"))
     for holder in ("bot@laptop-17", "bot@laptop-18"):
         ours.on_safety(safety(holder))
     assert "laptop" not in ours.lost
     assert "another" in ours.lost
-    theirs = LeaseMonitor("red", "bot@laptop-17")
+    theirs = LeaseMonitor("red", Sender("bot@laptop-17"))
     for holder in ("bot@laptop-17", "mia@laptop-17"):
         theirs.on_safety(safety(holder))
     assert theirs.lost == "red was taken by mia (person)"
 
 
 def test_late_publication_of_old_state_is_no_news() -> None:
-    ours, told = LeaseMonitor("red", "bot"), [safety("mia"), safety("bot"), safety("mia")]
+    ours, told = LeaseMonitor("red", Sender("bot")), [safety("mia"), safety("bot"), safety("mia")]
     for seq, message in enumerate(told, start=1):
         message.boot_id, message.seq = "a", seq
     before, had, taken = told
@@ -81,14 +116,14 @@ def test_late_publication_of_old_state_is_no_news() -> None:
     assert ours.lost.endswith("by mia (person)")
     again = safety("bob")
     again.boot_id, again.seq = "b", 1
-    ours = LeaseMonitor("red", "bot")
+    ours = LeaseMonitor("red", Sender("bot"))
     for message in (had, again):
         ours.on_safety(message)
     assert ours.lost.endswith("by bob (person)"), "a gateway that began anew counts anew"
 
 
 def test_a_refusal_says_who_has_it() -> None:
-    ours = LeaseMonitor("red", "bot")
+    ours = LeaseMonitor("red", Sender("bot"))
     ours.on_outcome(Outcome("red", ok=False, phase="rejected", reason="unsupported", words="no arm"))
     assert not ours.lost
     ours.on_outcome(Outcome("red", ok=False, phase="rejected", reason="leased", words="red is driven by mia"))

@@ -5,8 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet.console.hold_to_drive import AFTER_STOP_S, MAX_ECHO_GAP_S, MAX_TICK_AGE_S, PressBook, PressRefused
+from schemas.rights import People, PersonRole
 
 RED = ("red",)
+PEOPLE = People(dict.fromkeys(("head", "teacher"), PersonRole.LEAD))
 
 
 def book_with_press(*, at: float = 10.0, cars: tuple[str, ...] = RED) -> tuple[PressBook, int]:
@@ -141,15 +143,15 @@ def test_computer_sleep_ends_presses_and_old_ticks_do_not_count() -> None:
     [("teacher", "pupil", True), ("pupil", "teacher", False), ("teacher", "head", False), ("pupil", "other", False)],
 )
 def test_only_lead_takes_car_of_person(person: str, holder: str, *, takes: bool) -> None:
-    book, leads = PressBook(), ("head", "teacher")
+    book = PressBook()
     tick = book.tick(10.0)
-    book.begin(1, 1, ("red", "blue"), "forward", tick, 10.0, person=holder, leads=leads)
+    book.begin(1, 1, ("red", "blue"), "forward", tick, 10.0, person=holder, people=PEOPLE)
     if not takes:
         with pytest.raises(PressRefused, match=f"{holder} drives red"):
-            book.begin(2, 1, RED, "back", tick, 10.0, person=person, leads=leads)
+            book.begin(2, 1, RED, "back", tick, 10.0, person=person, people=PEOPLE)
         assert [press.client for press in book.alive] == [1]
         return
-    press, (taken,) = book.begin(2, 1, RED, "back", tick, 10.0, person=person, leads=leads)
+    press, (taken,) = book.begin(2, 1, RED, "back", tick, 10.0, person=person, people=PEOPLE)
     assert (press.motion, taken.client) == ("back", 1)
     assert [each.client for each in book.alive] == [2]
     assert book.echo(1, 1, tick, 10.1) is None, "what was taken does not drive on"
@@ -166,10 +168,10 @@ def test_only_lead_takes_car_of_person(person: str, holder: str, *, takes: bool)
     ],
 )
 def test_mode_or_release_ends_no_press_of_higher_rank(person: str, holder: str, *, ends: bool) -> None:
-    book, leads = PressBook(), ("head", "teacher")
-    book.begin(1, 1, RED, "forward", book.tick(10.0), 10.0, person=holder, leads=leads)
-    assert not book.drop_cars_of({"blue"}, person, leads)
-    assert bool(book.drop_cars_of({"red"}, person, leads)) is ends
+    book = PressBook()
+    book.begin(1, 1, RED, "forward", book.tick(10.0), 10.0, person=holder, people=PEOPLE)
+    assert not book.drop_cars_of({"blue"}, person, PEOPLE)
+    assert bool(book.drop_cars_of({"red"}, person, PEOPLE)) is ends
     assert bool(book.alive) is not ends
 
 
