@@ -59,8 +59,18 @@ class CarProfile(Protocol):
     def not_observed(self) -> tuple[str, ...]:
         """Sentences about such cars that were only read or assumed. Empty if everything was observed on a car."""
 
+    @property
+    def has_network(self) -> bool:
+        """True if a TCP port is the car's own. False if it belongs to a bridge, which outlives its clients."""
+
     def measurable(self, mode: Mode) -> frozenset[str]:
         """Return the names of all readings that such a car can send in this mode: `range`, `battery`, `line`, ..."""
 
     def why_lacking(self, capability: str) -> str | None:
         """Return a sentence on why the car lacks a capability. None if the car, or every car, has the capability."""
+
+    def hint(self, odd: str) -> str:
+        """Return the likely cause of something odd in such cars, as a sentence. Empty if there is none of their own.
+
+        odd: a finding of `fleet doctor` (`silent`, `not_obeyed`), or a field whose values are always out of range.
+        """

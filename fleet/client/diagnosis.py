@@ -13,6 +13,7 @@ from fleet.client.claims import describe_end_of_doubt
 from fleet.client.gateway_clock import describe_clock
 from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
+from gateway import drivers
 from schemas.bluetooth import ADAPTER_FULL
 from schemas.keys import name_of
 from schemas.local_time import clock
@@ -25,7 +26,6 @@ from schemas.words import (
     Mode,
     Motors,
     Phase,
-    Platform,
     Reason,
     Shows,
     Verdict,
@@ -41,12 +41,8 @@ _MIN_REJECTED: Final = 10
 MAX_AIRTIME: Final = 0.8
 MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
+_SILENT: Final = "silent"
 _PORT_SHARED: Final = "port_shared"
-_OUT_OF_RANGE: Final = {
-    "PV": "A battery of three cells is named by +3s, as in `platform: arduino+3s`.",
-    "GS": "Over 1023 it is a converter of 12 bits: `platform: stm32`?",
-}
-"""By field: the likely cause if its values are always out of range."""
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
 _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
 """Counts in `rejects` of a link that are not rejected frames."""
@@ -189,7 +185,7 @@ def _out_of_range(e: CarEvidence) -> str:
     if not health.out_of_range:
         return ""
     fields = ", ".join(health.out_of_range)
-    hints = [words for field, words in _OUT_OF_RANGE.items() if field in health.out_of_range]
+    hints = filter(None, (drivers.hint(health.platform, field) for field in health.out_of_range))
     return " ".join((f"Always out of range for a {health.platform} car, and so never published: {fields}.", *hints))
 
 
@@ -213,10 +209,9 @@ def _silent_car(e: CarEvidence) -> str:
     last_rx_s = e.state.last_rx_s
     since = "since its link opened" if last_rx_s is None else f"for {last_rx_s:.0f} s"
     words = f"The link is open, and the car has been silent {since}. Is it on, near enough, and charged?"
-    platform = e.state.health.platform.partition("+")[0]
-    if e.state.link.rx_frames or (platform and platform not in tuple(Platform)):
-        return words  # it has sent readings, or is of another family
-    return f"{words} If it drives but never sends readings, set `platform: raspberry_pi+no_readings` in the fleet file."
+    was_heard = e.state.link.rx_frames > 0
+    hint = "" if was_heard else drivers.hint(e.state.health.platform, _SILENT)
+    return f"{words} {hint}" if hint else words
 
 
 def _shared(e: CarEvidence) -> str:
@@ -343,7 +338,7 @@ CHECKS: Final = (
     DoctorCheck("not_shown", _doubted, "fleet stop {car}"),
     DoctorCheck("no_frames", _baud, "fleet logs {car}"),
     DoctorCheck("fan_silence", _silent_fan, "fleet fan {car}"),
-    DoctorCheck("silent", _silent_car, "fleet watch '{car}/sensor/*'"),
+    DoctorCheck(_SILENT, _silent_car, "fleet watch '{car}/sensor/*'"),
     DoctorCheck(_PORT_SHARED, _shared, "fleet logs {car}"),
     DoctorCheck("out_of_range", _out_of_range, "fleet watch {car}/frame/rx"),
     DoctorCheck("damaged_frames", _damaged, "fleet watch {car}/frame/rx"),
@@ -443,9 +438,8 @@ def describe_reports(health: Any) -> str:
         )
         rhythm = f"every {health.interval_s:.2f} s (spread {health.interval_spread_s:.2f} s{blocks}); "
     words = f"{rhythm}{health.shows_stops_words or 'what they show is not known yet'}"
-    # The reports of most arduino programs show a stop, if the frames arrive.
-    is_odd = health.shows_stops == Shows.NO and health.platform.partition("+")[0] == Platform.ARDUINO
-    return f"{words}. If it obeys nothing: look at the wire to its RX pin" if is_odd else words
+    hint = drivers.hint(health.platform, _NOT_OBEYED) if health.shows_stops == Shows.NO else ""
+    return f"{words}. {hint}" if hint else words
 
 
 def as_dict(evidence: CarEvidence, options: str = "") -> dict[str, Any]:

@@ -333,7 +333,7 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
         yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
     platform, given = normalize_name(str(merged.get("platform", AUTO))), merged.get("without")
     if car.get("link") == LINK_SIM and platform.partition("+")[0] in (AUTO, Platform.UNKNOWN):
-        kinds = ", ".join(kind for kind in Platform if kind is not Platform.UNKNOWN)
+        kinds = ", ".join(kind for kind in drivers.built_in_platforms() if kind != Platform.UNKNOWN)
         yield ("cars", name, "platform"), f"a simulated car needs a platform. There are {kinds}."
     if car.get("link") == LINK_SIM and (why := drivers.why_not_simulated(platform)):
         yield ("cars", name, "link"), f"{why}. Give the link of a real car, or a program that behaves like one."

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Final
 
 from fleet.fleet_links import SimLink, may_be_same, parse_fleet_link
 from fleet.fleetfile.fleet_file import FleetCar
+from gateway import drivers
 from schemas.links import UsbUrl
 from schemas.process import port_lock
 from schemas.process.usb_bus import CH340, explain_missing_port
-from schemas.words import LinkState, Platform
+from schemas.words import LinkState
 
 if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
@@ -28,8 +29,6 @@ HOST_TIMEOUT_S: Final = 3.0
 """Timeout for the reply of a host."""
 CLOSED_PORT: Final = 9
 """A TCP port without a listener (discard): a reachable host refuses a connection at once."""
-_BRIDGED_PLATFORMS: Final = (Platform.ARDUINO, Platform.STM32)
-"""Platforms without a network: their TCP port belongs to a bridge, which outlives its clients."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +66,7 @@ class _Look:
     """Looks at the device or host that the link of a car of this platform names."""
 
     def __init__(self, platform: str) -> None:
-        self._has_bridge = platform.partition("+")[0] in _BRIDGED_PLATFORMS
+        self._has_bridge = not any(profile.has_network for profile in drivers.profiles_of(platform))
 
     def device(self, path: str) -> tuple[bool, str]:
         return check_device(path)

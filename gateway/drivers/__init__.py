@@ -95,6 +95,29 @@ def built_in_profiles() -> tuple[CarProfile, ...]:
     return tuple(profile for module in BUILT_IN.values() for profile in _load(module).profiles())
 
 
+@cache
+def all_profiles() -> tuple[CarProfile, ...]:
+    """Return the profile of each platform that is installed, with all parts that such a car may have."""
+    found = list(built_in_profiles())
+    for name, family in _installed():
+        try:
+            found += family.profiles()
+        except Exception as error:  # noqa: BLE001 - as in `_installed`
+            broken[name] = f"profiles() raises {type(error).__name__}: {error}"
+    return tuple(found)
+
+
+def hint(platform: str, odd: str) -> str:
+    """Return the likely cause of something odd in cars of a platform (see `CarProfile.hint`).
+
+    It is empty if the driver of the platform is not installed here. Without a platform, the car is one of `unknown`.
+    """
+    try:
+        return profile_of(platform or Platform.UNKNOWN).hint(odd)
+    except ValueError:
+        return ""
+
+
 def why_not_simulated(platform: str) -> str:
     """Return why `gateway sim` has no cars of a platform. Empty if it has, or if there is no such platform."""
     kind = kind_of(normalize_name(platform))

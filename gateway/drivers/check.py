@@ -94,6 +94,7 @@ PROFILE_TYPES: Final[Mapping[str, tuple[type, ...]]] = {
     "baud": (int,),
     "dead_man_s": (int, float, type(None)),
     "not_observed": (tuple,),
+    "has_network": (bool,),
 }
 """The types of a profile's fields. Other modules use the fields without checking them."""
 PROFILE_WORDS: Final[Mapping[str, frozenset[str]]] = {
@@ -104,6 +105,8 @@ PROFILE_WORDS: Final[Mapping[str, frozenset[str]]] = {
     "lights": frozenset(LightWord),
     "servos": frozenset(ServoAction),
 }
+FINDINGS: Final = ("silent", "not_obeyed", "range")
+"""Some of what `fleet doctor` asks `CarProfile.hint` about: two findings, and a field."""
 HOSTILE: Final = (
     *(b"NaN", b"-Infinity", b"1e999", b"-1", b"9" * 400, b"9" * 5000),
     *(b"null", b'"x"', b"[]", b"{}", b"true", b""),
@@ -248,6 +251,9 @@ def check_profile(family: Family, platform: str) -> Iterator[str]:
     for word in CAPABILITIES:
         if word not in profile.capabilities and not profile.why_lacking(word):
             yield f"the car has no capability {word!r}, but why_lacking gives no reason"
+    for odd in FINDINGS:
+        if not _is(hint := profile.hint(odd), str):
+            yield f"hint({odd!r}) is {_kind(hint)}, not str"
 
 
 def check_bytes(family: Family, platform: str) -> Iterator[str]:

@@ -26,6 +26,10 @@ class PlainProfile:
     drives on while the link is alive."""
     not_observed: tuple[str, ...] = ()
     """Facts that were read or assumed, but not seen on a car, as sentences."""
+    has_network: bool = True
+    """True if a TCP port is the car's own. False if it belongs to a bridge, so that `fleet check` may connect to it."""
+    hints: tuple[tuple[str, str], ...] = ()
+    """The likely cause of a finding of `fleet doctor` (`silent`, `not_obeyed`) in such cars, as a sentence for each."""
     modes: frozenset[Mode] = frozenset({Mode.MANUAL})
     silent_modes: frozenset[Mode] = frozenset()
 
@@ -47,3 +51,7 @@ class PlainProfile:
         """Return a sentence on why the car lacks a capability. None if it has it, or if there is no such capability."""
         known = capability in self.capabilities or capability not in CAPABILITIES
         return None if known else f"{self.name} cars have no {capability}"
+
+    def hint(self, odd: str) -> str:
+        """Return the likely cause of something odd in such cars, as a sentence. Empty if there is none."""
+        return dict(self.hints).get(odd, "")

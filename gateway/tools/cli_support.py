@@ -7,11 +7,14 @@ import sys
 from collections.abc import Callable, Coroutine, Iterable
 from typing import IO, Any, Final
 
+from gateway import drivers
 from gateway.capture import BadCapture
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
 from gateway.link import BadUrl, LinkError, LinkUrl
 from schemas.duration import parse_duration
+from schemas.platform_name import kind_of, normalize_name
 from schemas.process import startup, stdio
+from schemas.words import Platform
 
 PLATFORM_HELP: Final = "the car: arduino, stm32 or raspberry_pi, with options as in arduino+arm (default: unknown)"
 _UNPRINTABLE: Final = re.compile(r"[^ -\[\]-~]")
@@ -63,11 +66,17 @@ def duration(option: str, text: str, min_s: float, max_s: float) -> float:
 
 
 def profile_of(text: str) -> Profile:
-    """Return the profile that `--platform` names. Raises WrongUse if there is no such platform."""
+    """Return the profile that `--platform` names. Raises WrongUse if it is none whose frames these commands know."""
     try:
         return parse_platform(text)
     except ValueError as error:
-        raise WrongUse(str(error)) from None
+        kind = kind_of(normalize_name(text))
+        if kind in tuple(Platform) or kind not in drivers.platforms():
+            raise WrongUse(str(error)) from None
+        raise WrongUse(
+            f"{kind} cars speak another protocol, and this command knows only `$...#` frames. Serve the car with "
+            "`gateway run`; `fleet watch CAR/frame/rx` then shows its bytes."
+        ) from None
 
 
 def printable(data: bytes) -> str:

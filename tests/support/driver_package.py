@@ -23,11 +23,14 @@ def installed_driver(directory: Path, monkeypatch: pytest.MonkeyPatch, module: s
     """Install a package with the driver of a tank for this process."""
     install_driver(directory, module)
     monkeypatch.setattr(sys, "path", [str(directory), *sys.path])
-    drivers._installed.cache_clear()
-    drivers._find.cache_clear()
+    _forget()
     try:
         yield
     finally:
-        drivers._installed.cache_clear()
-        drivers._find.cache_clear()
+        _forget()
         drivers.broken.clear()
+
+
+def _forget() -> None:
+    for cached in (drivers._installed, drivers._find, drivers.all_profiles):
+        cached.cache_clear()

@@ -10,14 +10,12 @@ from typing import Any, Final
 
 from gateway import drivers
 from schemas.topics import FROM_OUTSIDE, TOPICS
-from schemas.words import UNKNOWN, Mode, Platform, Verdict
+from schemas.words import UNKNOWN, Mode, Verdict
 
 MODE: Final = TOPICS["state/mode"]
 assert MODE.stale_after_s is not None
 _HOLDS_NS: Final = round(MODE.stale_after_s * 1e9)
 """A state lasts until the next one, but not longer than until it is stale."""
-# Only Arduino cars are known to report in modes other than manual. No other car reports more than they do there.
-_PROFILE: Final = drivers.profile_of(Platform.ARDUINO)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +42,11 @@ def sensor_of(name: str) -> str:
 
 def does_exist(sensor: str, mode: Mode) -> bool:
     """Return True if cars send readings of this sensor in this mode. Manual mode counts as True for every sensor."""
-    return mode is Mode.MANUAL or f"sensor/{sensor}" in FROM_OUTSIDE or sensor in _PROFILE.measurable(mode)
+    return mode is Mode.MANUAL or f"sensor/{sensor}" in FROM_OUTSIDE or _is_measurable(sensor, mode)
+
+
+def _is_measurable(sensor: str, mode: Mode) -> bool:
+    return any(sensor in profile.measurable(mode) for profile in drivers.all_profiles())
 
 
 def mode_spans(states: Iterable[Mapping[str, Any]]) -> Iterator[ModeSpan]:

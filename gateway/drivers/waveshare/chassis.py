@@ -44,6 +44,7 @@ DEAD_MAN_S: Final = 3.0
 """Dead-man time of both firmwares after a reset. A gateway sets a shorter time, but a reset of the car undoes that."""
 CELLS: Final = 3
 _CAPABILITIES: Final = frozenset({"drive", "speed", "light"})
+_HINTS: Final = (("silent", "The gateway asks such a car for feedback: is the link the USB port of its board?"),)
 _NOT_OBSERVED: Final = ("everything: it was read in the source of the firmwares, and not tried on a car",)
 
 
@@ -64,4 +65,6 @@ def profile_of(name: str) -> PlainProfile:
         cells=CELLS,
         dead_man_s=DEAD_MAN_S,
         not_observed=_NOT_OBSERVED,
+        has_network=False,
+        hints=_HINTS,
     )

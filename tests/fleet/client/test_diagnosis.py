@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from fleet.client.car_state import CarState
-from fleet.client.diagnosis import CHECKS, CarEvidence, as_dict, describe, diagnose
+from fleet.client.diagnosis import CHECKS, CarEvidence, as_dict, describe, describe_reports, diagnose
+from gateway import drivers
 from schemas.bluetooth import describe_full
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -204,3 +205,16 @@ def test_the_facts_name_counts_evidence_and_the_last_refusal() -> None:
 def test_silent_car_of_another_family_is_not_advised_as_the_first(platform: str, advised: bool) -> None:
     found = diagnose(with_states(link=STALE, health=pb.Health(platform=platform)))
     assert any("raspberry_pi+no_readings" in each.cause for each in found) is advised
+    own = drivers.hint(platform, "silent")
+    assert own
+    assert any(each.code == "silent" and each.cause.endswith(own) for each in found)
+    was_heard = diagnose(with_states(link=pb.Link(state="stale", rx_frames=7), health=pb.Health(platform=platform)))
+    assert not any(own in each.cause for each in was_heard)
+
+
+@pytest.mark.parametrize(("platform", "advised"), [("arduino+arm", True), ("stm32", False), ("wave_rover", False)])
+def test_reports_that_show_no_stop_are_explained_by_the_family(platform: str, advised: bool) -> None:
+    health = pb.Health(platform=platform, shows_stops="no", shows_stops_words="they show none")
+    assert ("RX pin" in describe_reports(health)) is advised
+    health.shows_stops = "yes"
+    assert describe_reports(health) == "they show none"

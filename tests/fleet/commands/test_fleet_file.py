@@ -177,8 +177,11 @@ def test_ports_are_looked_at_and_left_alone(command: Command, port: Port, tcp: T
     assert tcp.connections == 0
 
 
-def test_a_bridge_is_connected_to_and_told_nothing(command: Command, tcp: TcpCar, tmp_path: Path) -> None:
-    (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{platform: arduino, link: '{tcp.link}'}}}}")
+@pytest.mark.parametrize("platform", ["arduino", "ugv_rover"])
+def test_a_bridge_is_connected_to_and_told_nothing(
+    command: Command, tcp: TcpCar, tmp_path: Path, platform: str
+) -> None:
+    (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{platform: {platform}, link: '{tcp.link}'}}}}")
     done = command("check")
     assert done.returncode == 0
     assert done.stdout.startswith(f"red  ok     {tcp.link}: ")

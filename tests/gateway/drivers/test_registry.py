@@ -1,12 +1,15 @@
 """A platform finds its family: ours by a table, others by the entry point of their package."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gateway import drivers
 from schemas.words import Mode
+from tests.support import tank
 from tests.support.driver_package import installed_driver
+from tests.support.text_parts import has_parts
 
 
 def test_every_platform_of_ours_has_a_profile_and_a_driver() -> None:
@@ -39,6 +42,26 @@ def test_a_family_of_another_package_is_found(tmp_path: Path, monkeypatch: pytes
         assert "tank" in drivers.platforms()
         assert drivers.check_platform("tank") == "tank"
         assert drivers.profile_of("tank").measurable(Mode.MANUAL) == {"battery", "range"}
+
+
+def test_hints_are_those_of_the_family(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert drivers.hint("tank", "silent") == "", "its driver is not installed"
+    monkeypatch.setattr(tank, "PROFILE", replace(tank.PROFILE, hints=(("silent", "Is its turret locked?"),)))
+    with installed_driver(tmp_path, monkeypatch, "tests.support.tank"):
+        assert drivers.hint("tank", "silent") == "Is its turret locked?"
+        assert drivers.hint("tank", "PV") == ""
+        found = {name: drivers.hint(name, "silent") for name in drivers.built_in_platforms()}
+    assert drivers.hint("", "silent") == found["unknown"] == found["arduino"] != ""
+    assert found["ugv_rover"] == found["wave_rover"] not in ("", found["unknown"])
+
+
+def test_every_installed_family_has_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with installed_driver(tmp_path, monkeypatch, "tests.support.tank"):
+        assert [each.name for each in drivers.all_profiles()][-1] == "tank"
+    monkeypatch.setattr(tank, "profiles", {}.popitem)
+    with installed_driver(tmp_path / "again", monkeypatch, "tests.support.tank"):
+        assert drivers.all_profiles() == drivers.built_in_profiles()
+        assert has_parts(drivers.broken["tank"], "profiles() … KeyError")
 
 
 def test_package_that_fails_is_named_and_others_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

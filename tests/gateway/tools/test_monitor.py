@@ -224,6 +224,7 @@ def test_a_tcp_car_is_warned_of_before_it_is_connected(start: Started) -> None:
         (["--link", "/dev/ttyUSB0", "--from", "x"], "not allowed"),
         (["--link", "usb:1"], "not a link"),
         (["--link", "/dev/ttyUSB0", "--platform", "pi"], 'Unknown platform "pi"'),
+        (["--link", "/dev/ttyUSB0", "--platform", "UGV_Rover"], "ugv_rover cars speak another protocol"),
         (["--from", "nothing"], "nothing: … : No such file"),
         (["--from", "/"], "directory"),
         (["--from", "/dev/zero"], "/dev/zero: … device"),

@@ -275,6 +275,18 @@ class Profile:
         frame = SPECIAL_CAPABILITIES.get(capability)
         return None if frame is None else self.refusal(frame)
 
+    @property
+    def has_network(self) -> bool:
+        """False if a TCP port of the car belongs to a bridge (docs/reference/protocol.md#platforms)."""
+        return self.kind not in {Platform.ARDUINO, Platform.STM32}
+
+    def hint(self, odd: str) -> str:
+        """Return the likely cause of something odd in such cars, as a sentence. Empty if there is none."""
+        # The reports of most arduino programs show a stop, if the frames arrive.
+        if odd == "not_obeyed" and self.kind is not Platform.ARDUINO:
+            return ""
+        return _HINTS.get(odd, "")
+
     def block_s(self, frame: Frame) -> float:
         """Return the maximum time in seconds for which this frame blocks the car (see `timing.block_s`)."""
         if self.kind is Platform.STM32:
@@ -397,6 +409,14 @@ def parse_platform(text: str) -> Profile:
     """Return the profile of a platform such as `arduino` or `stm32+arm+head=BALA` in any case, or raise ValueError."""
     return _profile(*parse_name(text))
 
+
+_HINTS: Final = {
+    "silent": f"If it drives but never sends readings, set `platform: raspberry_pi+{NO_READINGS}` in the fleet file.",
+    "not_obeyed": "If it obeys nothing: look at the wire to its RX pin",
+    "PV": "A battery of three cells is named by +3s, as in `platform: arduino+3s`.",
+    "GS": "Over 1023 it is a converter of 12 bits: `platform: stm32`?",
+}
+"""By finding of `fleet doctor`, or by the field whose values are always out of range."""
 
 # docs/reference/protocol.md#platforms
 _EVERY_CAR: Final = frozenset({"drive", "whistle", "speed", "servo", "fan", "light"})
