@@ -59,6 +59,7 @@ async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Pa
     control.link_up(loop.time())
     driver.shut_down(loop.time())
     reads = asyncio.ensure_future(_read(link, driver))
+    reads.add_done_callback(partial(_log_deaf, car))
     try:
         while not driver.finished:
             await _write(link, driver)
@@ -74,6 +75,13 @@ async def _stop(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Pa
             await reads
         await link.close()
     return driver.not_stopped
+
+
+def _log_deaf(car: str, reads: asyncio.Task[None]) -> None:
+    """Log why the driver reads nothing any more, unless the link is lost, or the stop is over."""
+    error = None if reads.cancelled() else reads.exception()
+    if error is not None and not isinstance(error, LinkLost):
+        log.error("the driver of %s failed to read: nothing it sends can show its stop", car, exc_info=error)
 
 
 async def _read(link: Link, driver: Driver) -> None:
