@@ -28,8 +28,6 @@ REPOSITORY: Final = re.compile(
 )
 DOCS: Final = tuple(page for page in PAGES if page.is_relative_to(ROOT / "docs"))
 TEXT_SUFFIXES: Final = frozenset({".py", ".proto", ".yaml", ".toml", ".service", ".rules", ".tsv", ".ipynb", ".sh"})
-
-GENERATORS: Final = ROOT / "tests/tools/pages"
 CITATION: Final = re.compile(r"(?<![\w./-])((?:[\w.-]+/)*[\w-]+\.md)\b(?:#([\w-]+))?")
 LINK: Final = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 CODE_PATH: Final = re.compile(r"`((?:gateway|fleet|schemas|tests|deploy)/[\w./-]+\.\w+)`")
