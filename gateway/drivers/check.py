@@ -105,6 +105,23 @@ PROFILE_WORDS: Final[Mapping[str, frozenset[str]]] = {
     "lights": frozenset(LightWord),
     "servos": frozenset(ServoAction),
 }
+ANSWERS: Final[Mapping[str, tuple[type, ...]]] = {
+    "lost_frames": (int,),
+    "shutting_down": (bool,),
+    "not_stopped": (str,),
+    "is_stopping": (bool,),
+    "finished": (bool,),
+    "opened_as": (str,),
+    "doubt_of_drive": (str,),
+    "kept": (Mapping,),
+    "flush_at": (int, float),
+    "next_at": (int, float),
+    "free_at": (int, float),
+    "worst_s": (int, float),
+    "accepts_commands": (bool,),
+    "wait_words": (str,),
+}
+"""The types of what a driver answers at any time. Methods from `next_at` on have the time as an argument."""
 FINDINGS: Final = ("silent", "not_obeyed", "range")
 """Some of what `fleet doctor` asks `CarProfile.hint` about: two findings, and a field."""
 HOSTILE: Final = (
@@ -112,6 +129,8 @@ HOSTILE: Final = (
     *(b"null", b'"x"', b"[]", b"{}", b"true", b""),
 )
 """Values that may replace a number in a report of a car, if the report is damaged or from another program."""
+NOISE: Final = b"?\r\n"
+"""Bytes that are no report of any car."""
 WRONG_OPTION: Final = "+no_such_option"
 _NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
 _PERSON: Final = Sender("ann@desk", Rank.PERSON)
@@ -304,6 +323,8 @@ def _faults_of_values(topic: str, fields: Mapping[str, Any]) -> Iterator[str]:
         except (TypeError, ValueError) as error:
             yield f"{topic}: {name} is {_kind(value)}: {error}"
         else:
+            if value is None or (_is(value, bool) and known[name].type != known[name].TYPE_BOOL):
+                yield f"{topic}: {name} is {value}, which is no measurement: leave it out, or give its number"
             if isinstance(value, float) and not math.isfinite(value):
                 yield f"{topic}: {name} is {value}: it was not measured, so leave it out"
 
@@ -316,6 +337,24 @@ def check_connect(family: Family, platform: str) -> Iterator[str]:
     if bench.control.driver.model.basis is Basis.SHOWN:
         yield "a car that said nothing counts as one that has shown its stop"
     yield from dict.fromkeys(bench.faults)
+
+
+def check_answers(family: Family, platform: str) -> Iterator[str]:
+    """Check the types of what the driver answers before, during and after a connection."""
+    bench = Bench(family, platform, _samples(family))
+    driver = bench.control.driver
+    steps: tuple[Callable[[float], object], ...] = (driver.flush, bench.control.link_up, driver.shut_down)
+    for step in steps:
+        step(bench.now)
+        for seconds in (0.0, 10.0):
+            bench.run(seconds)
+            for name, types in ANSWERS.items():
+                answer: Any = getattr(driver, name)
+                if callable(answer):
+                    answer = answer() if name in ("kept", "flush_at") else answer(bench.now)
+                if not _is(answer, *types) or (bool not in types and _is(answer, bool)):
+                    yield f"{name} is {_kind(answer)}, not {' or '.join(each.__name__ for each in types)}: {answer!r}"
+                    return
 
 
 def check_motions(family: Family, platform: str) -> Iterator[str]:
@@ -390,6 +429,11 @@ def check_rest(family: Family, platform: str) -> Iterator[str]:
     standing.ask(Stop())
     standing.run(30.0)
     moving: Sequence[bytes] = getattr(family, "MOVING", ())
+    told = _connected(family, platform, (NOISE,))
+    told.ask(Stop())
+    told.run(30.0)
+    if told.control.driver.model.basis is Basis.SHOWN:
+        yield f"a car that sends {NOISE!r} counts as one that has shown its stop, though that is no report"
     if standing.control.driver.model.basis is Basis.SHOWN and not moving:
         yield "its SAMPLES show a stop: add MOVING, a list of bytes that such a car sends while it moves"
     for sample in moving:
@@ -460,6 +504,8 @@ def check_actions(family: Family, platform: str) -> Iterator[str]:
     driver = bench.control.driver
     for what in ACTIONS:
         refusal = driver.refusal(what)
+        if not _is(refusal, str, type(None)):
+            yield f"the refusal of {what} is {_kind(refusal)}, not str or None"
         if refusal is not None and not refusal:
             yield f"{what} is refused without a reason"
         if refusal is None and not isinstance(what, SetMode | Find) and not driver.frames(what):
@@ -546,6 +592,7 @@ CHECKS: Final[tuple[Callable[[Family, str], Iterator[str]], ...]] = (
     check_profile,
     check_bytes,
     check_connect,
+    check_answers,
     check_motions,
     check_samples,
     check_hostile,

@@ -211,6 +211,60 @@ class Unsaved(tank.TankDriver):
         return {"speeds": {1: 0.5}}
 
 
+class Nulls(tank.TankDriver):
+    """Publishes None for what was not measured."""
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        return {topic: dict.fromkeys(fields) for topic, fields in super().measured(event).items()}
+
+
+class Flags(tank.TankDriver):
+    """Publishes a number as True."""
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        return {topic: dict.fromkeys(fields, True) for topic, fields in super().measured(event).items()}
+
+
+class RefusesInBytes(tank.TankDriver):
+    """Refuses in bytes."""
+
+    def refusal(self, what: Any) -> Any:
+        return (super().refusal(what) or "").encode() or None
+
+
+class WaitsForNone(tank.TankDriver):
+    """Says None if it waits for nothing."""
+
+    def wait_words(self, now: float) -> Any:
+        return None
+
+
+class KeepsList(tank.TankDriver):
+    """Would keep a list."""
+
+    def kept(self) -> Any:
+        return [1]
+
+
+class LosesText(tank.TankDriver):
+    """Counts in text."""
+
+    lost_frames = cast("Any", "1")
+
+
+class RestsByNoise(tank.TankDriver):
+    """Takes anything that arrives for a report of a car that stands."""
+
+    @property
+    def can_show(self) -> bool:
+        return True
+
+    def on_event(self, event: Event, now: float) -> None:
+        super().on_event(event, now)
+        if not isinstance(event, tank.TankReport):
+            self.show_rest("something arrives", now)
+
+
 class RestsAlways(tank.TankDriver):
     """Takes any report for one of a car that stands."""
 
@@ -233,6 +287,13 @@ class RestsAlways(tank.TankDriver):
         (Drops, {"check_loss"}),
         (Keeps, {"check_loss"}),
         (Unsaved, {"check_kept"}),
+        (Nulls, {"check_samples", "check_hostile"}),
+        (Flags, {"check_samples", "check_hostile"}),
+        (RefusesInBytes, {"check_actions"}),
+        (WaitsForNone, {"check_answers"}),
+        (KeepsList, {"check_answers"}),
+        (LosesText, {"check_answers"}),
+        (RestsByNoise, {"check_rest"}),
         (RestsAlways, {"check_rest"}),
         (BeatsOnly, {"check_drive"}),
         (BeatsAsleep, {"check_connect", "check_drive"}),
@@ -281,6 +342,14 @@ def test_a_careless_driver_fails(driver: Any, fails: set[str]) -> None:
         ({"profile_of": lambda name: tank.PROFILE}, {"check_names"}),
         ({"profile_of": lambda name: replace(tank.profile_of(name), baud=cast("int", "115200"))}, {"check_profile"}),
         ({"profile_of": lambda name: replace(tank.profile_of(name), cells=0)}, {"check_profile"}),
+        (
+            {"profile_of": lambda name: replace(tank.profile_of(name), has_network=cast("bool", "no"))},
+            {"check_profile"},
+        ),
+        (
+            {"profile_of": lambda name: replace(tank.profile_of(name), hints=(("silent", cast("str", 1)),))},
+            {"check_profile"},
+        ),
         ({"profile_of": lambda name: replace(tank.profile_of(name), measures=frozenset({"range"}))}, {"check_samples"}),
         (
             {"profile_of": lambda name: replace(tank.profile_of(name), capabilities=frozenset({"drives"}))},
