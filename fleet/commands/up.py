@@ -192,7 +192,9 @@ def _with_plan(spec: FleetSpec, text: str) -> FleetSpec:
     )  # as the coordinator will
     found = find_faults(plan, cars)
     found.raise_errors(str(spec.plan))
-    return replace(spec, plan_text=text, warnings=tuple(f"{spec.plan}: {each}" for each in found.warnings))
+    return replace(
+        spec, plan_text=text, warnings=(*spec.warnings, *(f"{spec.plan}: {each}" for each in found.warnings))
+    )
 
 
 def _own_arguments() -> list[str]:

@@ -103,7 +103,7 @@ class FleetSpec:
     insecure_lan: bool = False
     """True if the hub may listen on an address that other machines can reach."""
     warnings: tuple[str, ...] = ()
-    """Warnings of the plan's checks, one line each."""
+    """Warnings of the plan's checks, and of cars that are left out, one line each."""
 
     @property
     def simulated(self) -> list[CarProcessSpec]:
@@ -132,18 +132,23 @@ class UpOptions:
 def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
     """Return the spec of a fleet file and the options, which take precedence.
 
-    The first `options.simulated` cars of the file are simulated, whatever their link. Raises ValueError if one of them
-    cannot be.
+    The first `options.simulated` cars of the file are simulated, whatever their link. Those of them that cannot be are
+    left out with a warning. Raises ValueError if none of them can be.
     """
     specs = {} if file is None else {**file.cars, **file.unlinked}
     cars = {name: _car(spec) for name, spec in specs.items()}
     names = _names(list(cars), options.simulated)
-    cars = {name: car for name, car in cars.items() if car.link or name in names}
+    not_simulated = {
+        name: why for name in names if name in cars and (why := drivers.why_not_simulated(cars[name].platform))
+    }
+    warnings = tuple(f"{name} is left out, as it cannot be simulated: {why}." for name, why in not_simulated.items())
+    names = [name for name in names if name not in not_simulated]
+    if not_simulated and not names:
+        raise ValueError("\n".join(warnings))
+    cars = {name: car for name, car in cars.items() if name in names or (car.link and name not in not_simulated)}
     for index, name in enumerate(names):
         car = cars.get(name) or CarProcessSpec(name, SIMULATED, PLATFORMS[index % len(PLATFORMS)])
         # A simulated car needs a platform. The platform of a real car can be detected.
-        if why := drivers.why_not_simulated(car.platform):
-            raise ValueError(f"{name} cannot be simulated: {why}. Leave it out of the fleet file for --sim.")
         kind, *words = car.platform.split("+")
         platform = "+".join((Platform.ARDUINO if kind in (AUTO, Platform.UNKNOWN) else kind, *words))
         cars[name] = CarProcessSpec(name, SIMULATED, platform, car.arguments)
@@ -170,6 +175,7 @@ def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
         console_port=options.console_port or (file.console_port if file else 0),
         insecure_lan=options.insecure_lan,
         listed={name: _listed(specs.get(name), car.platform) for name, car in cars.items()},
+        warnings=warnings,
     )
 
 

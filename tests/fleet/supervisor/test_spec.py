@@ -26,6 +26,7 @@ from fleet.supervisor.spec import (
 from schemas.rights import NO_PEOPLE, People
 from schemas.yaml_document.document import BadFile
 from tests.support.driver_package import installed_driver
+from tests.support.text_parts import has_parts
 
 FILE = """
 name: lab
@@ -58,8 +59,13 @@ def test_cars_of_another_package_are_not_simulated(tmp_path: Path, monkeypatch: 
         assert "cars.max.link" in str(bad.value)
         file = parse_fleet(text.replace("LINK", "/dev/ttyUSB0"), tmp_path / "fleet.yaml")
         assert [each.platform for each in build_spec(file, UpOptions()).cars.values()] == ["tank", "stm32"]
-        with pytest.raises(ValueError, match="max cannot be simulated"):
-            build_spec(file, UpOptions(simulated=2))
+        for count, others in ((2, ["red"]), (3, ["red", "green"])):
+            spec = build_spec(file, UpOptions(simulated=count))
+            assert [each.name for each in spec.cars.values()] == [each.name for each in spec.simulated] == others
+            (warning,) = spec.warnings
+            assert has_parts(warning, "max … cannot be simulated … tank")
+        with pytest.raises(ValueError, match=r"max .* cannot be simulated"):
+            build_spec(file, UpOptions(simulated=1))
 
 
 @pytest.mark.parametrize(("quota", "size"), [("20GB", 20e9), ("1 MB", 1e6), ("999999GB", 999_999e9), ("999TB", 999e12)])
