@@ -21,7 +21,7 @@ LINK, OTHER = "serial:///dev/ttyUSB0", "serial:///dev/pts/7"
 NOW = 1_800_000_000_000_000_000
 
 
-def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
+def test_safety_state_is_restored(tmp_path: Path) -> None:
     directory = tmp_path / "not" / "yet" / "there"
     estop = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=True, rank=Rank.LEAD)
     kept = PersistedSafety(
@@ -41,7 +41,7 @@ def test_a_hold_is_read_back_by_the_next_process(tmp_path: Path) -> None:
     assert [path.name for path in directory.iterdir()] == ["fleet.red.json"]
 
 
-def test_a_hold_belongs_to_the_car_at_its_link(tmp_path: Path) -> None:
+def test_safety_state_of_other_link_is_kept_apart(tmp_path: Path) -> None:
     """A simulated red, held in one folder, kept a red on the table out of its plan, and the other way round."""
     own = Estop("e1", "mia", "smoke", NOW - 5, fleet_wide=False)
     everybody = Estop("e2", "mia", "fire", NOW - 5, fleet_wide=True)
@@ -88,19 +88,19 @@ def test_irrelevant_link_options_do_not_tell_cars_apart() -> None:
     assert len(links("tcp://a:1", "tcp://a:2", "serial://?vid=1a86", "serial://?vid=1a87")) == 4
 
 
-def test_a_hold_from_the_future_began_now(tmp_path: Path) -> None:
+def test_hold_from_future_begins_now(tmp_path: Path) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.save(PersistedSafety(Hold("mia", NOW + 10**30)))
     assert store.load(NOW) == PersistedSafety(Hold("mia", NOW))
 
 
-def test_a_file_of_a_version_without_e_stops_is_read(tmp_path: Path) -> None:
+def test_safety_file_without_estops_is_read(tmp_path: Path) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.path.write_text('{"hold": {"by": "mia", "since_ns": 7}}')
     assert store.load(NOW) == PersistedSafety(Hold("mia", 7))
 
 
-def test_a_file_of_a_version_without_ranks_is_read(tmp_path: Path) -> None:
+def test_safety_file_without_ranks_is_read(tmp_path: Path) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     estop = {"id": "e1", "by": "mia", "why": "", "at_ns": 7, "fleet_wide": True}
     store.path.write_text(json.dumps({"hold": {"by": "mia", "since_ns": 7}, "estops": [estop], "ended": ["e0"]}))
@@ -110,7 +110,7 @@ def test_a_file_of_a_version_without_ranks_is_read(tmp_path: Path) -> None:
     )
 
 
-def test_a_loan_that_is_over_is_forgotten(tmp_path: Path) -> None:
+def test_expired_loan_is_forgotten(tmp_path: Path) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     loan = Loan("bob", "mia", Rank.LEAD, NOW, 60.0)
     store.save(PersistedSafety(loan=loan))
@@ -165,7 +165,7 @@ def test_failed_save_is_told_and_keeps_old_state(tmp_path: Path) -> None:
         '{"hold": {"by": "mia", "since_ns": ' + "9" * 5000 + "}}",
     ],
 )
-def test_a_broken_file_holds_the_car(tmp_path: Path, text: str) -> None:
+def test_unreadable_safety_file_holds_car(tmp_path: Path, text: str) -> None:
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.path.write_text(text)
     held = store.load(NOW).hold

@@ -44,7 +44,7 @@ def age(ns: int) -> Bound:
         (" [now()..] ", age(0), FOREVER),
     ],
 )
-def test_a_range_is_half_open_in_nanoseconds(text: str, begin: Bound, end: Bound) -> None:
+def test_parse_range_is_half_open_in_nanoseconds(text: str, begin: Bound, end: Bound) -> None:
     assert parse_range(text) == (begin, end)
 
 
@@ -105,13 +105,13 @@ def test_history_ring_returns_latest_last_or_range(time_range: str | None, last:
 
 
 @pytest.mark.parametrize("step_s", [-3600, 3600])
-def test_a_wall_clock_that_was_set_makes_no_value_older(step_s: int) -> None:
+def test_clock_step_does_not_age_history(step_s: int) -> None:
     values = filled(8, clock_set_s=step_s).select(time_range="[now(-2s)..]", last=None, now=AT)
     assert [value.payload for value in values] == [b"6", b"7"]
 
 
 @pytest.mark.parametrize("step_s", [-3600, 0, 3600])
-def test_a_date_selects_by_the_stamp_that_was_published(step_s: int) -> None:
+def test_date_selects_by_published_stamp(step_s: int) -> None:
     ring = filled(8, clock_set_s=step_s)
     (third, _, _) = ring.select(time_range=None, last="3", now=AT)
     shown = datetime.fromtimestamp(third.stamp_ns / S, UTC).isoformat()
@@ -120,7 +120,7 @@ def test_a_date_selects_by_the_stamp_that_was_published(step_s: int) -> None:
         assert [value.payload for value in values] == [b"5", b"6", b"7"]
 
 
-def test_a_sleep_of_the_computer_makes_values_older() -> None:
+def test_computer_sleep_ages_history() -> None:
     ring = filled(8)
     ring.age(3600.0)
     ring.add(Value(AT, NOW, b"8"))
@@ -129,16 +129,16 @@ def test_a_sleep_of_the_computer_makes_values_older() -> None:
 
 
 @pytest.mark.parametrize("last", ["", "0", "-1", "1.5", "three", "³", "٣", "1_0", " 3", "inf", "0" * 5000])
-def test_a_last_that_is_no_count_is_refused(last: str) -> None:
+def test_invalid_last_count_is_refused(last: str) -> None:
     with pytest.raises(BadRange, match=f"whole number from 1 on. The history has at most {HISTORY} values"):
         filled(3).select(time_range=None, last=last, now=AT)
 
 
-def test_a_count_of_thousands_of_digits_is_all_there_is() -> None:
+def test_huge_last_count_returns_all() -> None:
     assert len(filled(3).select(time_range=None, last="9" * 5000, now=AT)) == 3
 
 
-def test_an_empty_ring_has_nothing_to_give() -> None:
+def test_empty_history_selects_nothing() -> None:
     for time_range, last in [(None, None), ("[..]", None), (None, "3")]:
         assert HistoryBuffer(3).select(time_range=time_range, last=last, now=AT) == []
 

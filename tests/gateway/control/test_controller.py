@@ -107,7 +107,9 @@ def desk() -> Workbench:
     ],
     ids=str,
 )
-def test_the_life_of_a_command(desk: Workbench, what: Action, frames: list[bytes], life: list[Phase]) -> None:
+def test_command_writes_its_frames_and_passes_its_phases(
+    desk: Workbench, what: Action, frames: list[bytes], life: list[Phase]
+) -> None:
     answer = desk.ask(what, identity="it")
     assert answer.status in (QUEUED, SENT)
     desk.run(6.0 if frames is SHOWN_STOP else 4.0)
@@ -118,7 +120,7 @@ def test_the_life_of_a_command(desk: Workbench, what: Action, frames: list[bytes
     assert all(b.at >= a.at for a, b in zip(desk.records, desk.records[1:], strict=False))
 
 
-def test_an_opened_mode_is_seen_when_its_reading_comes(desk: Workbench) -> None:
+def test_mode_effect_is_seen_by_reading_of_that_mode(desk: Workbench) -> None:
     desk.ask(SetMode(Mode.TRACKING), identity="it")
     desk.run(2.4)
     assert desk.life("it")[-1] is SENT
@@ -143,7 +145,7 @@ def test_changed_motion_is_resent_exactly_once(desk: Workbench) -> None:
     ]
 
 
-def test_the_same_motion_held_on_is_not_written_again(desk: Workbench) -> None:
+def test_repeated_drive_of_same_motion_writes_no_frame(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD), identity="first")
     for number in range(20):
         desk.run(0.25)
@@ -160,7 +162,7 @@ def test_the_same_motion_held_on_is_not_written_again(desk: Workbench) -> None:
     assert desk.end("hers") == (SENT, None)
 
 
-def test_the_newest_motion_wins_and_only_it_is_written(desk: Workbench) -> None:
+def test_newest_queued_drive_supersedes_earlier_ones(desk: Workbench) -> None:
     desk.ask(WHISTLE)  # blocks for 0.3 s, so the next commands wait
     for number, motion in enumerate([Motion.FORWARD, Motion.LEFT, Motion.RIGHT, Motion.BACK]):
         assert desk.ask(Drive(motion, 2.0), identity=f"m{number}").status is QUEUED
@@ -189,7 +191,7 @@ def test_motion_overtakes_what_queues(desk: Workbench) -> None:
     ],
     ids=str,
 )
-def test_a_one_shot_while_driving_carries_the_motion(desk: Workbench, what: Action, frame: bytes) -> None:
+def test_one_shot_frame_carries_held_motion(desk: Workbench, what: Action, frame: bytes) -> None:
     desk.ask(FORWARD)
     desk.run(2.0)
     desk.ask(what)
@@ -197,7 +199,7 @@ def test_a_one_shot_while_driving_carries_the_motion(desk: Workbench, what: Acti
     assert desk.frames == [RUN, RUN, frame]
 
 
-def test_the_repetition_after_a_one_shot_repeats_the_motion_alone(desk: Workbench) -> None:
+def test_drive_repeat_after_one_shot_has_motion_only(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(0.5)
     desk.ask(Fan())
@@ -205,7 +207,7 @@ def test_the_repetition_after_a_one_shot_repeats_the_motion_alone(desk: Workbenc
     assert desk.frames == [RUN, b"$1,0,0,0,0,0,0,1,0#", RUN], "a toggle is never repeated"
 
 
-def test_a_drive_expires_and_stops_softly(desk: Workbench) -> None:
+def test_drive_end_sends_soft_stop(desk: Workbench) -> None:
     began = desk.now
     desk.ask(Drive(Motion.BACK, 0.7), identity="it")
     desk.run(3.0)
@@ -232,7 +234,7 @@ def test_unshown_rest_is_renewed_with_growing_pauses(desk: Workbench) -> None:
     assert set(gaps[2:]) == {RENEWAL_INTERVALS_S[-1]}
 
 
-def test_a_rest_that_was_shown_is_left_alone(desk: Workbench) -> None:
+def test_shown_rest_sends_no_more_stops(desk: Workbench) -> None:
     desk.run(60.0)
     assert (desk.frames, desk.control.driver.model.basis) == ([], Basis.SHOWN)
 
@@ -255,7 +257,7 @@ def test_repeated_waiting_drive_has_last_duration(desk: Workbench) -> None:
     assert [each.words for each in desk.records if each.basis][-1].endswith("sent for 1.0 s")
 
 
-def test_a_drive_within_a_soft_stop_goes_on_at_once(desk: Workbench) -> None:
+def test_drive_replaces_soft_stop_at_once(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 0.3))
     desk.run(0.6)
     desk.ask(Drive(Motion.FORWARD, 1.0), identity="on")
@@ -282,7 +284,7 @@ def test_drive_during_full_stop_waits_for_first_frames(desk: Workbench, duration
     assert desk.now - began == pytest.approx(duration_s, abs=0.06)
 
 
-def test_a_sample_of_a_stream_does_not_wait(desk: Workbench) -> None:
+def test_streamed_drive_is_rejected_if_it_would_wait(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop())
@@ -291,7 +293,7 @@ def test_a_sample_of_a_stream_does_not_wait(desk: Workbench) -> None:
     assert (short.status, short.reason) == (Phase.REJECTED, Reason.EXPIRED)
 
 
-def test_a_drive_released_by_hand(desk: Workbench) -> None:
+def test_drive_stop_releases_held_motion_without_hold(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it")
     desk.run(0.5)
     assert desk.ask(Drive(Motion.STOP), identity="off").status is QUEUED
@@ -307,7 +309,7 @@ def test_a_drive_released_by_hand(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- senders, stalls
 
 
-def test_a_sender_that_is_away_for_a_second_is_lost(desk: Workbench) -> None:
+def test_sender_token_away_for_one_second_ends_drive(desk: Workbench) -> None:
     desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
     desk.run(2.0)
@@ -324,7 +326,7 @@ def test_a_sender_that_is_away_for_a_second_is_lost(desk: Workbench) -> None:
     assert desk.records[-1].words == "its sender mia disconnected"
 
 
-def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) -> None:
+def test_sender_token_that_comes_after_its_drive_is_watched(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
     desk.run(0.01)
     desk.control.on_sender_token("mia", alive=True, now=desk.now)
@@ -337,14 +339,14 @@ def test_a_token_that_its_first_drive_has_overtaken_is_watched(desk: Workbench) 
     assert "mia disconnected" in desk.records[-1].words
 
 
-def test_a_sender_without_a_token_is_not_watched(desk: Workbench) -> None:
+def test_sender_without_token_is_not_watched(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0), PERSON)
     desk.control.on_sender_token("ann", alive=False, now=desk.now)
     desk.run(4.0)
     assert desk.frames == [RUN, RUN]
 
 
-def test_a_stalled_loop_stops_the_car_first(desk: Workbench) -> None:
+def test_loop_stall_stops_held_drive(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it")
     desk.run(2.0)
     desk.control.driver.on_stall(0.4, desk.now)
@@ -363,7 +365,7 @@ def test_a_stalled_loop_stops_the_car_first(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- one-shots
 
 
-def test_one_shots_queue_so_many_and_no_more_each_once(desk: Workbench) -> None:
+def test_one_shot_queue_is_bounded_and_sends_each_once(desk: Workbench) -> None:
     answers = [desk.ask(Fan() if number % 2 else ChangeSpeed(SpeedStep.UP)) for number in range(12)]
     accepted = [answer for answer in answers if answer.status is not Phase.REJECTED]
     assert len(accepted) == 9, "one was written, eight wait"
@@ -372,7 +374,7 @@ def test_one_shots_queue_so_many_and_no_more_each_once(desk: Workbench) -> None:
     assert [data[15:16] + data[7:8] for data in desk.frames] == [b"01", b"10"] * 4 + [b"01"]
 
 
-def test_a_mode_says_how_long_its_stop_delays_it(desk: Workbench) -> None:
+def test_mode_answer_announces_delay_by_its_stop(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     wait_s, asked_at = desk.control.wait_s(SetMode(Mode.TRACKING), desk.now), desk.now
@@ -382,7 +384,7 @@ def test_a_mode_says_how_long_its_stop_delays_it(desk: Workbench) -> None:
     assert desk.now <= asked_at + wait_s
 
 
-def test_a_drive_waits_for_the_recovery_at_the_connect() -> None:
+def test_drive_waits_for_recovery_after_connect() -> None:
     desk = Workbench()
     desk.control.link_up(desk.now)
     desk.pump()
@@ -414,7 +416,7 @@ def test_queued_command_expires_for_busy_car(what: Action, monkeypatch: pytest.M
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
 
 
-def test_one_shots_asked_before_a_mode_are_sent_before_it(desk: Workbench) -> None:
+def test_one_shots_queued_before_mode_are_sent_before_it(desk: Workbench) -> None:
     desk.ask(WHISTLE)
     desk.ask(AimServo(30))
     desk.ask(SetMode(Mode.TRACKING))
@@ -437,7 +439,7 @@ def test_mode_while_driving_stops_then_opens(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- hold
 
 
-def test_a_stop_by_hand_holds_the_car_against_the_coordinator(desk: Workbench) -> None:
+def test_stop_of_person_holds_car_against_coordinator(desk: Workbench) -> None:
     assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
     desk.ask(Stop(), PERSON)
     assert desk.control.safety.hold == Hold("mia", int(desk.now * 1e9))
@@ -466,7 +468,7 @@ def test_drive_mode_or_resume_of_person_or_script_ends_hold(desk: Workbench, wha
     assert desk.logs[-1].code == "hold_ended"
 
 
-def test_a_refused_command_does_not_end_the_hold(desk: Workbench) -> None:
+def test_refused_command_does_not_end_hold(desk: Workbench) -> None:
     desk.ask(Stop(), PERSON)
     assert desk.ask(FORWARD, age_s=9.0).reason is Reason.STALE
     desk.control.driver.link_down("unplugged", desk.now)
@@ -476,7 +478,7 @@ def test_a_refused_command_does_not_end_the_hold(desk: Workbench) -> None:
     assert desk.control.safety.hold is None
 
 
-def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Workbench) -> None:
+def test_coordinator_stop_sets_no_hold_and_coordinator_may_not_resume(desk: Workbench) -> None:
     desk.ask(Stop(), COORDINATOR)
     assert desk.control.safety.hold is None
     desk.run(2.0)
@@ -484,7 +486,7 @@ def test_a_coordinators_stop_holds_nothing_and_it_may_never_resume(desk: Workben
     assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
 
 
-def test_a_hold_from_before_a_restart_counts() -> None:
+def test_hold_survives_gateway_restart() -> None:
     desk = Workbench(kept=PersistedSafety(Hold("mia", 1))).ready()
     assert desk.ask(FORWARD, COORDINATOR).reason is Reason.HELD
     assert desk.ask(FORWARD, PERSON).status is QUEUED
@@ -558,7 +560,7 @@ def test_stream_is_recorded_at_start_changes_and_end(desk: Workbench) -> None:
     ]
 
 
-def test_a_refused_stream_is_recorded_once_per_cause(desk: Workbench) -> None:
+def test_refused_stream_is_recorded_once_per_cause(desk: Workbench) -> None:
     desk.ask(Stop(), PERSON)
     before = len(desk.records)
     for _ in range(50):
@@ -569,7 +571,7 @@ def test_a_refused_stream_is_recorded_once_per_cause(desk: Workbench) -> None:
 # ---------------------------------------------------------------------- link and recovery
 
 
-def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Workbench) -> None:
+def test_link_loss_fails_queued_and_held_commands(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="held")
     desk.ask(WHISTLE, identity="act")
     desk.control.driver.link_down("unplugged", desk.now)
@@ -592,7 +594,7 @@ def test_a_lost_link_fails_what_waits_and_what_is_held(desk: Workbench) -> None:
     assert desk.frames == [RUN]
 
 
-def test_a_failed_write_fails_its_command_and_what_waits(desk: Workbench) -> None:
+def test_write_failure_fails_its_command_and_queued_ones(desk: Workbench) -> None:
     desk.ask(FORWARD, identity="it", pump=False)
     desk.ask(WHISTLE, identity="act", pump=False)
     write = desk.control.driver.poll(desk.now)
@@ -607,7 +609,7 @@ def test_a_failed_write_fails_its_command_and_what_waits(desk: Workbench) -> Non
     assert desk.frames == [b"#"], "recovery"
 
 
-def test_a_stop_under_way_fails_with_its_link(desk: Workbench) -> None:
+def test_stop_in_progress_fails_with_link_loss(desk: Workbench) -> None:
     desk.ask(Stop(), identity="it")
     desk.control.driver.link_down("unplugged", desk.now)
     desk.take()
@@ -692,7 +694,7 @@ STATES = [idle, driving, acting, opening, stopping, recovering]
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi", "unknown"])
-def test_a_shutdown_ends_when_its_stop_is_shown_or_sent(platform: str, state: Callable[[Workbench], None]) -> None:
+def test_shutdown_ends_when_stop_is_shown_or_sent(platform: str, state: Callable[[Workbench], None]) -> None:
     desk = Workbench(platform).ready()
     state(desk)
     began, sent = desk.now, len(desk.sent)
@@ -746,7 +748,7 @@ def test_shutdown_without_link_says_not_stopped_at_once(desk: Workbench) -> None
     assert "red is unreachable (unplugged)" in desk.logs[0].words
 
 
-def test_a_stop_during_the_shutdown_says_who_stops_the_car(desk: Workbench) -> None:
+def test_stop_command_during_shutdown_says_not_confirmed_or_not_stopped(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 5.0))
     desk.run(0.5)
     desk.control.driver.shut_down(desk.now)
@@ -790,7 +792,7 @@ def test_shutdown_while_tracking_waits_until_stop_is_shown() -> None:
     assert not pair.control.driver.stops.not_stopped
 
 
-def test_a_link_that_goes_during_the_last_stop_is_said(desk: Workbench) -> None:
+def test_link_loss_during_shutdown_logs_not_stopped(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.control.driver.shut_down(desk.now)
     desk.run(0.5)
@@ -867,7 +869,7 @@ def test_any_commands_keep_one_frame_in_flight_and_stop_wins(platform: str) -> N
         assert ended == {record.command.id for record in desk.records}, "every command has an end"
 
 
-def test_the_simulated_car_agrees_about_the_fan_and_the_speed() -> None:
+def test_believed_fan_and_speed_match_simulated_car() -> None:
     pair = Pair(start_s=2.0).ready()
     for _ in range(3):
         pair.ask(Fan())

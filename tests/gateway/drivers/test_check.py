@@ -23,7 +23,7 @@ FAMILIES = {"yahboom": yahboom, "waveshare": waveshare, "tank": tank}
 @pytest.mark.parametrize(
     ("name", "platform"), [(name, platform) for name, family in FAMILIES.items() for platform in family.PLATFORMS]
 )
-def test_a_family_passes_every_check(name: str, platform: str) -> None:
+def test_families_pass_driver_check(name: str, platform: str) -> None:
     family = cast("Family", FAMILIES[name])
     found = {each.__name__: list(each(family, platform)) for each in check.CHECKS}
     assert found == {each.__name__: [] for each in check.CHECKS}
@@ -312,7 +312,7 @@ class RestsAlways(tank.TankDriver):
         (OnlySays, {"check_drive"}),
     ],
 )
-def test_a_careless_driver_fails(driver: Any, fails: set[str]) -> None:
+def test_careless_driver_fails_driver_check(driver: Any, fails: set[str]) -> None:
     family = SimpleNamespace(
         PLATFORMS=("tank",),
         SAMPLES=tank.SAMPLES,
@@ -357,7 +357,7 @@ def test_a_careless_driver_fails(driver: Any, fails: set[str]) -> None:
         ),
     ],
 )
-def test_a_careless_family_fails(changes: dict[str, Any], fails: set[str]) -> None:
+def test_careless_family_fails_driver_check(changes: dict[str, Any], fails: set[str]) -> None:
     family = SimpleNamespace(**{**vars(tank), **changes})
     found = {name: faults for _, name, faults in check.check(cast("Family", family)) if faults}
     assert next(iter(fails)) in found or found.keys() & fails, found
@@ -370,7 +370,7 @@ MOVES = b'{"T":1001,"L":0.2,"R":0.2,"odl":1,"odr":1,"v":1100}\n'
 
 @pytest.mark.parametrize("platform", waveshare.PLATFORMS)
 @pytest.mark.parametrize("moving", [(), (MOVES,), (STANDS,)])
-def test_a_rest_is_not_shown_by_any_report(platform: str, moving: tuple[bytes, ...]) -> None:
+def test_rest_shown_by_any_report_needs_moving_samples(platform: str, moving: tuple[bytes, ...]) -> None:
     family = SimpleNamespace(**vars(waveshare), SAMPLES=(STANDS,), MOVING=moving)
     bench = check.Bench(cast("Family", family), platform, (STANDS,))
     bench.control.link_up(bench.now)
@@ -380,7 +380,7 @@ def test_a_rest_is_not_shown_by_any_report(platform: str, moving: tuple[bytes, .
     assert not list(check.check_hostile(cast("Family", family), platform))
 
 
-def test_a_driver_that_floods_is_found() -> None:
+def test_flooding_driver_is_found() -> None:
     bench = check.Bench(cast("Family", SimpleNamespace(driver_of=lambda name, kept: Floods)), "tank")
     bench.control.link_up(bench.now)
     bench.run(1.0)
@@ -403,7 +403,7 @@ def test_bench_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any(b'"move": [0.5, 0.5]' in data for _, data, _ in scope["bench"].sent)
 
 
-def test_the_command_names_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_driver_check_command_names_missing_parts(capsys: pytest.CaptureFixture[str]) -> None:
     assert check.main([]) == 2
     assert check.main(["no_such_module"]) == 2
     assert check.main(["json"]) == 2

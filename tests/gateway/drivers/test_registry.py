@@ -12,7 +12,7 @@ from tests.support.driver_package import installed_driver
 from tests.support.text_parts import has_parts
 
 
-def test_every_platform_of_ours_has_a_profile_and_a_driver() -> None:
+def test_built_in_platforms_have_profile_and_driver() -> None:
     assert {"arduino", "stm32", "raspberry_pi", "unknown", "wave_rover", "ugv_beast"} <= set(
         drivers.built_in_platforms()
     )
@@ -26,7 +26,7 @@ def test_every_platform_of_ours_has_a_profile_and_a_driver() -> None:
 
 
 @pytest.mark.parametrize("name", ["ugv_rovr", "", "ugv_rover+arm", "+arm", "arduino+arn"])
-def test_a_wrong_name_is_refused_in_words(name: str) -> None:
+def test_wrong_platform_name_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match=r"Unknown (platform|option)"):
         drivers.check_platform(name)
 
@@ -37,7 +37,7 @@ def test_names_are_read_in_any_case() -> None:
     assert [each.name for each in drivers.profiles_of("auto+arm")] == ["arduino+arm", "stm32+arm", "raspberry_pi+arm"]
 
 
-def test_a_family_of_another_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_family_of_other_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with installed_driver(tmp_path, monkeypatch, "tests.support.tank"):
         assert "tank" in drivers.platforms()
         assert drivers.check_platform("tank") == "tank"
@@ -55,7 +55,7 @@ def test_hints_are_those_of_the_family(tmp_path: Path, monkeypatch: pytest.Monke
     assert found["ugv_rover"] == found["wave_rover"] not in ("", found["unknown"])
 
 
-def test_every_installed_family_has_profiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_profiles_include_installed_families(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with installed_driver(tmp_path, monkeypatch, "tests.support.tank"):
         assert [each.name for each in drivers.all_profiles()][-1] == "tank"
     monkeypatch.setattr(tank, "profiles", {}.popitem)

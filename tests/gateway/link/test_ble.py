@@ -69,7 +69,7 @@ async def refused(peer: BlePeer, url: BleUrl | None = None, timeout_s: float = P
 
 
 @pytest.mark.parametrize("gatt", KINDS.values(), ids=KINDS)
-async def test_each_kind_of_module(peer: BlePeer, gatt: tuple[object, ...]) -> None:
+async def test_ble_module_kinds_read_and_write(peer: BlePeer, gatt: tuple[object, ...]) -> None:
     peer.module.gatt = gatt  # type: ignore[assignment]  # as the constants are
     link = await open_link(peer.url)
     await link.write(LED)
@@ -79,7 +79,7 @@ async def test_each_kind_of_module(peer: BlePeer, gatt: tuple[object, ...]) -> N
     await link.close()
 
 
-async def test_a_clone_is_written_to_where_it_passes_bytes_on(peer: BlePeer) -> None:
+async def test_ble_clone_is_written_at_fff2(peer: BlePeer) -> None:
     """Ebyte's modules and their clones: FFF1 notifies, FFF2 is written, even if FFF1 takes bytes as well."""
     peer.module.gatt = FFF0
     link = await open_link(peer.url)
@@ -88,7 +88,7 @@ async def test_a_clone_is_written_to_where_it_passes_bytes_on(peer: BlePeer) -> 
     await link.close()
 
 
-async def test_a_frame_goes_in_pieces_of_what_the_module_takes(peer: BlePeer) -> None:
+async def test_ble_frame_is_split_by_mtu(peer: BlePeer) -> None:
     """The fake rejects a longer piece, as BlueZ does."""
     for mtu, pieces in ((23, [LED[:20], LED[20:]]), (28, [LED[:25], LED[25:]]), (185, [LED])):
         peer.module.mtu = mtu
@@ -151,7 +151,7 @@ async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
     await first.close()
 
 
-async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
+async def test_ble_module_that_does_not_connect_is_refused(peer: BlePeer) -> None:
     peer.module.connects = False
     words = await refused(peer, timeout_s=3.0)
     assert f"{peer.module.address} is there" in words
@@ -160,7 +160,7 @@ async def test_a_module_that_does_not_connect(peer: BlePeer) -> None:
     await (await open_link(peer.url)).close()
 
 
-async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_ble_disconnect_has_timeout(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
     """BlueZ answers neither Connect nor Disconnect. bleak alone would wait forever."""
     monkeypatch.setattr(ble, "DISCONNECT_TIMEOUT_S", 0.2)
     peer.module.connects = peer.module.leaves = False
@@ -174,31 +174,31 @@ async def test_a_module_that_does_not_even_let_go(peer: BlePeer, monkeypatch: py
         await link.read()
 
 
-async def test_a_module_whose_notifications_do_not_begin(peer: BlePeer) -> None:
+async def test_ble_module_without_notifications_is_refused(peer: BlePeer) -> None:
     peer.module.notifies = False
     assert "sends nothing" in await refused(peer, timeout_s=3.0)
     assert not peer.module.connected, "it can be found again"
 
 
-async def test_a_device_that_is_no_uart(peer: BlePeer) -> None:
+async def test_ble_device_without_uart_is_refused(peer: BlePeer) -> None:
     peer.module.gatt = BATTERY
     assert f"(FFE0, FFF0, Nordic's). It has: {BATTERY[0][0]}" in await refused(peer)
     assert not peer.module.connected
 
 
-async def test_no_bluetooth(peer: BlePeer) -> None:
+async def test_missing_bluetooth_service_is_reported(peer: BlePeer) -> None:
     peer.bluez.kill()
     words = await refused(peer)
     assert "[org.freedesktop.DBus.Error.ServiceUnknown]" in words
     assert "adapter" in words
 
 
-async def test_an_adapter_that_is_off(peer: BlePeer) -> None:
+async def test_powered_off_bluetooth_adapter_is_reported(peer: BlePeer) -> None:
     peer.bluez.powered = False
     assert "powered Bluetooth adapters" in await refused(peer)
 
 
-async def test_no_system_bus(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_missing_system_bus_is_reported(peer: BlePeer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", "unix:path=/nonexistent/bus")
     assert "Bluetooth cannot be used, [Errno 2] " in await refused(peer)
 
@@ -243,7 +243,7 @@ async def test_dead_bluetooth_service_is_noticed_and_found_again(peer: BlePeer) 
     await link.close()
 
 
-async def test_a_service_that_died_unnoticed(peer: BlePeer) -> None:
+async def test_ble_link_reopens_after_bluetooth_service_restart(peer: BlePeer) -> None:
     """The restarted service has no connection, although bleak remembers one."""
     link = await open_link(peer.url)
     peer.bluez.kill()

@@ -57,7 +57,7 @@ from tests.support.text_parts import has_parts
         ("tcp://[::1]:65535", TcpUrl("::1", 65535), "tcp://[::1]:65535"),
     ],
 )
-def test_a_url_names_a_link_and_is_written_back(text: str, url: LinkUrl, written: str | None) -> None:
+def test_link_url_round_trip(text: str, url: LinkUrl, written: str | None) -> None:
     assert parse_url(text) == url
     assert parse_url(str(url)) == url
     assert written is None or str(url) == written
@@ -132,7 +132,7 @@ async def refused(url: LinkUrl, timeout_s: float = 20.0) -> str:
     return words
 
 
-async def test_a_serial_port_that_cannot_be_opened(tmp_path: Path) -> None:
+async def test_unopenable_serial_port_is_refused(tmp_path: Path) -> None:
     assert "no such port" in await refused(SerialUrl(str(tmp_path / "ttyUSB9")))
     assert "no such port" in await refused(SerialUrl(str(tmp_path / "no" / "ttyUSB9")))
     assert "is a directory" in await refused(SerialUrl(str(tmp_path)))
@@ -145,7 +145,7 @@ async def test_a_serial_port_that_cannot_be_opened(tmp_path: Path) -> None:
     await no_threads()
 
 
-async def test_a_port_that_another_program_has(tmp_path: Path) -> None:
+async def test_serial_port_in_use_names_process(tmp_path: Path) -> None:
     peer = PtyPeer(tmp_path)
     with serial.Serial(str(tmp_path / "tty"), exclusive=True):
         assert f"by process {os.getpid()} (" in await refused(peer.url)
@@ -168,7 +168,7 @@ except CannotOpen as error:
 """
 
 
-def test_a_port_that_we_may_not_open_names_its_group(tmp_path: Path) -> None:
+def test_serial_port_without_permission_names_group(tmp_path: Path) -> None:
     """Root may open any port, so a process of the user nobody tries. Other users try in this process."""
     peer = PtyPeer(tmp_path)
     port = (tmp_path / "tty").resolve()
@@ -188,7 +188,7 @@ def test_a_port_that_we_may_not_open_names_its_group(tmp_path: Path) -> None:
     peer.close()
 
 
-async def test_a_tcp_car_that_cannot_be_reached() -> None:
+async def test_unreachable_tcp_car_is_refused() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # bound, not listening: refuses, and no other process gets the port
         words = await refused(TcpUrl("127.0.0.1", taken.getsockname()[1]))
@@ -219,7 +219,7 @@ print(*(name in sys.modules for name in ("serial", "serial.tools", "bleak")))
 """
 
 
-def test_only_what_a_link_needs_is_imported(tmp_path: Path) -> None:
+def test_link_kind_imports_only_its_library(tmp_path: Path) -> None:
     """A fleet starts up to a hundred gateways, and each would pay for an unused import."""
     peer = PtyPeer(tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -298,7 +298,7 @@ async def test_late_name_server_answer_serves_next_try(monkeypatch: pytest.Monke
             await link.close()
 
 
-async def test_a_tcp_car_that_does_not_answer() -> None:
+async def test_tcp_connect_has_timeout() -> None:
     """A listener with a full queue drops new connections, and is as silent as a car that is off."""
     with socket.socket() as full:
         full.bind(("127.0.0.1", 0))

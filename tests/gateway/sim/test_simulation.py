@@ -46,7 +46,7 @@ def where(simulation: Simulation, name: str) -> tuple[str, int]:
     return host, int(port)
 
 
-async def test_a_pty_is_paced_at_9600_baud_both_ways(pair: Simulation) -> None:
+async def test_pty_is_paced_at_9600_baud(pair: Simulation) -> None:
     car = pair.cars["red"]
     with serial.Serial(car.url.removeprefix("serial://"), timeout=0) as port:
         port.write(FAN)  # while the fan runs, the car sends no reading of its own
@@ -75,7 +75,7 @@ async def test_a_pty_is_paced_at_9600_baud_both_ways(pair: Simulation) -> None:
         assert time.monotonic() - begun >= 1500 / 960 - 0.2
 
 
-async def test_a_firehose_is_held_back_not_hoarded(pair: Simulation) -> None:
+async def test_pty_firehose_is_held_back(pair: Simulation) -> None:
     car = pair.cars["red"]
     with serial.Serial(car.url.removeprefix("serial://"), write_timeout=0.2) as port:
         with pytest.raises(serial.SerialTimeoutException):
@@ -108,7 +108,7 @@ async def test_dropped_pty_returns_under_its_name(pair: Simulation, tmp_path: Pa
         await until(lambda: pair.cars["red"].truth.mode == "manual", "hears again")
 
 
-async def test_a_plain_pty_says_its_new_name() -> None:
+async def test_pty_reports_new_name_after_link_drop() -> None:
     simulation = Simulation(parse_cars(["red:arduino:pty"]))
     await simulation.start()
     car = simulation.cars["red"]
@@ -123,7 +123,7 @@ async def test_a_plain_pty_says_its_new_name() -> None:
     await simulation.stop()
 
 
-async def test_a_tcp_firehose_is_held_back_too(pair: Simulation) -> None:
+async def test_tcp_firehose_is_held_back(pair: Simulation) -> None:
     _, writer = await asyncio.open_connection(*where(pair, "green"))
     car = pair.cars["green"]
     writer.write(b"$4WD,nonsense#" * 200_000)
@@ -180,7 +180,7 @@ async def driven(simulation: Simulation, car: str) -> tuple[str, int, asyncio.St
     return host, port, writer
 
 
-async def test_a_raspberry_pi_never_survives_a_lost_link(pair: Simulation) -> None:
+async def test_raspberry_pi_program_dies_with_its_link(pair: Simulation) -> None:
     host, port, writer = await driven(pair, "blue")
     await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0.1))
     await until(lambda: not pair.cars["blue"].truth.alive, "dies")
@@ -206,7 +206,7 @@ async def test_a_raspberry_pi_never_survives_a_lost_link(pair: Simulation) -> No
     writer.close()
 
 
-async def test_a_second_host_is_sent_away(pair: Simulation) -> None:
+async def test_second_tcp_client_is_sent_away(pair: Simulation) -> None:
     host, port = where(pair, "green")
     _, first = await asyncio.open_connection(host, port)
     reader, second = await asyncio.open_connection(host, port)
@@ -227,7 +227,7 @@ async def test_garbage_reaches_the_host_and_the_car(pair: Simulation) -> None:
         await pair.inflict(Fault(FaultKind.GARBAGE, "red", bytes=50, ways=(Direction.TO_CAR,)))
 
 
-async def test_a_port_in_use_and_a_path_in_use(tmp_path: Path) -> None:
+async def test_endpoint_in_use_is_refused(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(EndpointError, match=rf"car red: cannot listen on 127.0.0.1:{port}"):
@@ -240,7 +240,7 @@ async def test_a_port_in_use_and_a_path_in_use(tmp_path: Path) -> None:
         await Simulation(parse_cars([f"red:arduino:pty:{tmp_path / 'nowhere' / 'x'}"])).start()
 
 
-async def test_a_symlink_that_a_killed_simulator_left_is_replaced(tmp_path: Path) -> None:
+async def test_symlink_of_killed_simulator_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "red"
     path.symlink_to("/dev/pts/99999")
     simulation = Simulation(parse_cars([f"red:arduino:pty:{path}"]))
@@ -264,7 +264,7 @@ async def test_reused_pty_number_keeps_no_stale_symlink(tmp_path: Path) -> None:
     os.close(controller)
 
 
-async def test_a_live_simulators_symlink_is_not_taken(pair: Simulation, tmp_path: Path) -> None:
+async def test_symlink_of_running_simulator_is_refused(pair: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "red"
     first = path.readlink()
     with serial.Serial(str(path)):  # a host that opens the port does not change the owner
@@ -276,7 +276,7 @@ async def test_a_live_simulators_symlink_is_not_taken(pair: Simulation, tmp_path
 
 
 @pytest.mark.parametrize("target", ["/dev/null", "/dev/pts/ptmx", "nowhere"])
-def test_a_symlink_of_somebody_else_is_left_alone(target: str, tmp_path: Path) -> None:
+def test_foreign_symlink_is_left_alone(target: str, tmp_path: Path) -> None:
     path = tmp_path / "precious"
     path.symlink_to(target)
     command = [sys.executable, "-m", "gateway.sim", "--no-truth", "--car", f"red:arduino:pty:{path}"]
@@ -365,7 +365,7 @@ def test_simulator_announces_cars_takes_faults_and_ends_clean(
 
 
 @pytest.mark.parametrize("closed", [">&-", "<&-", ">/dev/full", "<&- >&-", ""])
-def test_the_cars_go_on_without_streams(closed: str, tmp_path: Path) -> None:
+def test_simulated_cars_run_without_standard_streams(closed: str, tmp_path: Path) -> None:
     """An opened file may get the descriptor of a closed stream.
 
     Without a redirection stdout is a pipe whose reader is gone.
@@ -583,7 +583,7 @@ async def test_truth_that_nobody_can_see_is_said_once(monkeypatch: pytest.Monkey
     assert said.empty()
 
 
-async def test_the_options_of_a_car_reach_its_program() -> None:
+async def test_car_options_reach_its_program() -> None:
     simulation = Simulation(parse_cars(["red:arduino+interval=0.2+head=BALA:pty", "blue:course:tcp"]))
     await simulation.start()
     data = bytearray()

@@ -43,7 +43,7 @@ def kept(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_file_is_shown_decoded_beside_its_bytes(command: Command, kept: Path) -> None:
+def test_monitor_decodes_capture_file(command: Command, kept: Path) -> None:
     done = command("monitor", "--from", kept)
     assert done.returncode == 0
     shown = [
@@ -151,7 +151,7 @@ def _is_raw(device: int) -> bool:
     return not termios.tcgetattr(device)[3] & termios.ICANON
 
 
-def test_a_pipe_that_closes_ends_it_quietly(simulate: Callable[..., Any], tmp_path: Path) -> None:
+def test_monitor_ends_quietly_on_closed_pipe(simulate: Callable[..., Any], tmp_path: Path) -> None:
     _, [link] = simulate("red:arduino+imu:pty")
     long = tmp_path / "long"  # its lines do not fit into a pipe
     writer = CaptureWriter(long, "link", "now")
@@ -173,7 +173,7 @@ def test_a_pipe_that_closes_ends_it_quietly(simulate: Callable[..., Any], tmp_pa
             assert monitor.wait(PATIENCE_S) == 1
 
 
-def test_a_full_disk_is_one_line(command: Command, kept: Path) -> None:
+def test_monitor_on_full_disk_is_one_line(command: Command, kept: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-m", "gateway.cli", "monitor", "--from", kept],
@@ -189,7 +189,7 @@ def test_a_full_disk_is_one_line(command: Command, kept: Path) -> None:
 
 
 @pytest.mark.parametrize("arguments", [["monitor", "--from", "KEPT"], ["scan", "--link", "/dev/nope"]])
-def test_a_closed_stdout_is_one_line(arguments: list[str], kept: Path) -> None:
+def test_closed_stdout_is_one_line(arguments: list[str], kept: Path) -> None:
     words = [word.replace("KEPT", str(kept)) for word in arguments]
     done = subprocess.run(
         ["sh", "-c", 'exec "$@" >&-', "sh", sys.executable, "-m", "gateway.cli", *words],
@@ -203,7 +203,7 @@ def test_a_closed_stdout_is_one_line(arguments: list[str], kept: Path) -> None:
     assert done.stderr.endswith(": Bad file descriptor\n")
 
 
-def test_a_tcp_car_is_warned_of_before_it_is_connected(start: Started) -> None:
+def test_monitor_warns_before_tcp_connect(start: Started) -> None:
     car = TcpCar()
     try:
         monitor = _live(start, car.link)
@@ -240,7 +240,7 @@ def test_wrong_use_is_one_line(command: Command, arguments: list[str], words: st
     assert done.stdout == ""
 
 
-def test_a_link_that_cannot_be_had_leaves_no_file(command: Command, tmp_path: Path) -> None:
+def test_monitor_of_missing_link_leaves_no_file(command: Command, tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     done = command("monitor", "--link", "/dev/nope", "--raw", kept)
     assert done.returncode == 1
@@ -249,7 +249,7 @@ def test_a_link_that_cannot_be_had_leaves_no_file(command: Command, tmp_path: Pa
     assert not kept.exists()
 
 
-def test_a_file_that_is_there_is_not_written_over(command: Command, tmp_path: Path) -> None:
+def test_monitor_overwrites_no_file(command: Command, tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     kept.write_text("mine")
     done = command("monitor", "--link", "/dev/nope", "--raw", kept)

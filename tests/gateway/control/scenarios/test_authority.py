@@ -30,7 +30,7 @@ def desk() -> Workbench:
 # ---------------------------------------------------------------------- e-stop
 
 
-def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
+def test_estop_latches_until_its_id_is_resumed(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT)
     answer = desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
     assert answer.status is QUEUED
@@ -57,7 +57,7 @@ def test_an_e_stop_is_latched_until_its_id_is_resumed(desk: Workbench) -> None:
     assert desk.ask(FORWARD, SCRIPT).status is QUEUED
 
 
-def test_the_hold_outlives_the_e_stop(desk: Workbench) -> None:
+def test_hold_outlives_estop(desk: Workbench) -> None:
     desk.ask(EmergencyStop("smoke"), COORDINATOR, identity="e1")
     desk.run(5.0)
     released = desk.ask(Resume(("e1",)), PERSON).words
@@ -91,7 +91,7 @@ def test_estop_of_unreachable_car_is_latched(desk: Workbench) -> None:
     assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
 
 
-def test_an_e_stop_survives_a_restart() -> None:
+def test_estop_survives_gateway_restart() -> None:
     estop = Estop("e1", "mia", "smoke", 7, fleet_wide=False)
     desk = Workbench(kept=PersistedSafety(None, (estop,), ())).ready()
     assert desk.ask(FORWARD, PERSON).reason is Reason.ESTOPPED
@@ -99,7 +99,7 @@ def test_an_e_stop_survives_a_restart() -> None:
     assert desk.control.safety.persisted == PersistedSafety(None, (), ("e1",))
 
 
-def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Workbench) -> None:
+def test_estop_merged_from_other_gateway_stops_car(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT, identity="d")
     estop = Estop("e1", "mia", "smoke", 7, fleet_wide=True)
     desk.control.merge_estops([estop], [], "blue", desk.now)
@@ -116,7 +116,7 @@ def test_an_e_stop_that_another_gateway_shows_stops_this_car(desk: Workbench) ->
     assert desk.ask(FORWARD, PERSON).status is QUEUED
 
 
-def test_an_e_stop_at_rest_is_carried_out_too(desk: Workbench) -> None:
+def test_estop_at_rest_is_carried_out(desk: Workbench) -> None:
     desk.control.merge_estops([Estop("e1", "mia", "", 7, fleet_wide=True)], [], "blue", desk.now)
     desk.run(6.0)
     assert desk.frames == SHOWN_STOP
@@ -153,7 +153,7 @@ def test_finished_command_line_keeps_lease_from_lower_rank_only(desk: Workbench)
     assert desk.ask(FORWARD, COORDINATOR).status is QUEUED
 
 
-def test_a_holder_that_is_back_has_its_lease_again(desk: Workbench) -> None:
+def test_lease_holder_that_reconnects_keeps_lease(desk: Workbench) -> None:
     """A restart of the hub removes all tokens for a moment."""
     desk.control.on_sender_token("mia", alive=True, now=desk.now)
     desk.ask(Drive(Motion.FORWARD, 1.0), PERSON)
@@ -163,13 +163,13 @@ def test_a_holder_that_is_back_has_its_lease_again(desk: Workbench) -> None:
     assert desk.ask(FORWARD, BOB).reason is Reason.LEASED
 
 
-def test_a_held_car_is_no_coordinators(desk: Workbench) -> None:
+def test_stop_of_person_ends_lease_of_coordinator(desk: Workbench) -> None:
     desk.ask(FORWARD, COORDINATOR)
     desk.ask(Stop(), PERSON)
     assert desk.control.safety.lease_at(desk.now) is None
 
 
-def test_a_release_shortens_the_lease(desk: Workbench) -> None:
+def test_drive_release_shortens_lease(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 9.0), SCRIPT)
     desk.ask(Drive(Motion.STOP), SCRIPT)
     desk.run(2.1)
@@ -212,7 +212,7 @@ def test_taking_the_lease_alone_stops_what_the_other_drove(desk: Workbench) -> N
     assert desk.frames == [RUN, STOP, STOP]
 
 
-def test_a_lease_can_be_given_back(desk: Workbench) -> None:
+def test_lease_release_frees_car_and_ends_drive(desk: Workbench) -> None:
     desk.ask(FORWARD, PERSON, identity="d")
     assert "no lease" in desk.ask(TakeLease(release=True), BOB).words
     assert desk.ask(TakeLease(release=True), PERSON).words == "red is free"
@@ -220,7 +220,7 @@ def test_a_lease_can_be_given_back(desk: Workbench) -> None:
     assert desk.ask(FORWARD, BOB).status is QUEUED
 
 
-def test_a_stop_needs_no_lease_and_ends_it(desk: Workbench) -> None:
+def test_stop_needs_no_lease_and_ends_lease(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 9.0), PERSON)
     assert desk.ask(Stop(), SCRIPT).status is QUEUED
     desk.run(2.1)
@@ -280,7 +280,7 @@ def test_stick_kept_out_by_lease_does_not_drive_after_stop(desk: Workbench) -> N
     assert desk.frames == [RUN, *SHOWN_STOP]
 
 
-def test_a_stream_that_says_stop_is_heard_again_at_once(desk: Workbench) -> None:
+def test_stream_that_sends_stop_may_drive_again_at_once(desk: Workbench) -> None:
     stick = Drive(Motion.FORWARD, 0.5)
     desk.ask(stick, SCRIPT, streamed=True)
     desk.ask(Stop(), SCRIPT)
@@ -291,7 +291,7 @@ def test_a_stream_that_says_stop_is_heard_again_at_once(desk: Workbench) -> None
     assert desk.ask(Drive(Motion.FORWARD, 9.0), SCRIPT, streamed=True).status is QUEUED
 
 
-def test_a_single_drive_is_no_stream(desk: Workbench) -> None:
+def test_single_drive_after_stop_needs_no_pause(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT)
     desk.ask(Stop(), PERSON)
     desk.run(2.0)
@@ -310,7 +310,7 @@ def test_repeated_drives_release_first(desk: Workbench) -> None:
     assert desk.ask(FORWARD, SCRIPT).status is QUEUED
 
 
-def test_a_script_that_drives_stops_and_drives_leans_on_nothing(desk: Workbench) -> None:
+def test_script_may_drive_again_right_after_its_own_stop(desk: Workbench) -> None:
     desk.ask(FORWARD, SCRIPT)
     desk.run(0.1)
     desk.ask(Stop(), SCRIPT)

@@ -42,7 +42,7 @@ def test_ugv_moves_only_with_known_firmware_and_chassis(platform: str) -> None:
     assert episode.car.wrong_since is None
 
 
-def test_a_car_with_another_firmware_is_stopped_and_never_driven() -> None:
+def test_wrong_firmware_is_stopped_and_never_driven() -> None:
     episode = ready("wave_rover", told="ugv_rover")
     assert episode.ask(Drive(Motion.FORWARD)) is Phase.REJECTED
     assert episode.records[-1].reason is Reason.UNSUPPORTED
@@ -51,7 +51,7 @@ def test_a_car_with_another_firmware_is_stopped_and_never_driven() -> None:
     assert episode.control.driver.model.findings.platform_contradictions
 
 
-def test_a_held_motion_feeds_the_dead_man_and_is_clamped() -> None:
+def test_held_motion_feeds_dead_man_and_is_clamped() -> None:
     episode = ready("ugv01")
     began = episode.now
     episode.ask(Drive(Motion.SPIN_LEFT, 3.0))
@@ -72,7 +72,9 @@ def test_a_held_motion_feeds_the_dead_man_and_is_clamped() -> None:
         ("ugv_rover", frozenset({"no_encoder"}), Basis.SENT, Shows.UNKNOWN),
     ],
 )
-def test_only_measured_wheels_show_a_stop(platform: str, options: frozenset[str], basis: Basis, shows: Shows) -> None:
+def test_stop_is_shown_by_measured_wheels_only(
+    platform: str, options: frozenset[str], basis: Basis, shows: Shows
+) -> None:
     episode = ready(platform, options=options)
     model = episode.control.driver.model
     assert model.basis is Basis.SENT, "it was not driven yet"
@@ -86,7 +88,7 @@ def test_only_measured_wheels_show_a_stop(platform: str, options: frozenset[str]
     assert not episode.car.moving
 
 
-def test_a_lost_link_ends_at_the_dead_man() -> None:
+def test_link_loss_ends_drive_by_dead_man() -> None:
     episode = ready("ugv_beast")
     episode.ask(Drive(Motion.FORWARD, 9.0))
     episode.run(1.0)
@@ -97,7 +99,7 @@ def test_a_lost_link_ends_at_the_dead_man() -> None:
     assert episode.control.driver.model.motors is Motors.UNKNOWN, "nothing shows it"
 
 
-def test_a_restart_takes_the_permission_back() -> None:
+def test_car_restart_repeats_setup_before_drives() -> None:
     episode = ready("ugv01")
     episode.ask(Drive(Motion.FORWARD, 9.0))
     episode.run(1.0)
@@ -111,7 +113,7 @@ def test_a_restart_takes_the_permission_back() -> None:
     assert episode.ask(Drive(Motion.BACK, 0.5)) is not Phase.REJECTED
 
 
-def test_a_motion_that_nobody_commanded_is_stopped() -> None:
+def test_unasked_motion_is_stopped() -> None:
     episode = ready("ugv_rover")
     episode.car.press(Button.FORWARD, episode.now)
     episode.run(1.3)
@@ -133,7 +135,7 @@ def test_own_setup_frames_are_no_other_program() -> None:
     assert "other_program" not in [each.code for each in episode.logs]
 
 
-def test_a_wheel_without_a_signal_ends_the_drive() -> None:
+def test_wheel_without_encoder_signal_ends_drive_as_stuck() -> None:
     episode = ready("ugv_rover", options=frozenset({"no_encoder"}))
     episode.ask(Drive(Motion.FORWARD, 5.0))
     episode.run(2.0)
@@ -141,7 +143,7 @@ def test_a_wheel_without_a_signal_ends_the_drive() -> None:
     assert [each.reason for each in episode.records if each.phase is Phase.FAILED] == [Reason.STUCK]
 
 
-def test_the_stop_of_a_person_waits_for_nothing() -> None:
+def test_stop_of_person_does_not_wait_for_boot() -> None:
     episode = UgvEpisode(1, "ugv_rover", frozen_options=frozenset())
     episode.car.brown_out(0.0)
     episode.connect()
@@ -161,7 +163,7 @@ def test_ugv_refuses_what_it_lacks_and_lights_work() -> None:
     assert episode.car.truth.led == "#ffffff"
 
 
-def test_no_command_outside_the_list_can_be_written() -> None:
+def test_line_refuses_commands_outside_allow_list() -> None:
     for kind in (0, 2, 13, 111, 138, 140, 242, 405, 600, 603):
         with pytest.raises(AssertionError):
             waveshare.line(kind, cmd=-1)
@@ -172,7 +174,7 @@ def test_no_command_outside_the_list_can_be_written() -> None:
 # ---------------------------------------------------------------------- cars and links that differ
 
 
-def test_a_slow_link_shows_its_stops() -> None:
+def test_stop_is_shown_over_slow_link() -> None:
     episode = UgvEpisode(1, "ugv_rover", frozen_options=frozenset())
     episode.delay_s = 0.4
     episode.connect()
@@ -182,7 +184,7 @@ def test_a_slow_link_shows_its_stops() -> None:
     assert episode.control.driver.model.basis is Basis.SHOWN
 
 
-def test_an_echo_that_is_switched_off_ends_stops_as_sent() -> None:
+def test_stop_is_sent_if_echo_is_switched_off() -> None:
     episode = ready("ugv_rover")
     episode.ask(Drive(Motion.FORWARD, 1.0))
     episode.run(4.0)
@@ -207,7 +209,7 @@ def test_missing_chassis_echo_locks_no_car_out() -> None:
 
 
 @pytest.mark.parametrize("field", ["temp", "odl"])
-def test_a_relative_that_lacks_a_field_is_driven(field: str) -> None:
+def test_firmware_without_one_field_is_driven(field: str) -> None:
     episode = UgvEpisode(1, "ugv01" if field == "temp" else "ugv_rover", frozen_options=frozenset())
     printed = episode.car._print
     episode.car._print = lambda data: printed(data.replace(f'"{field}"'.encode(), b'"other"'))  # type: ignore[method-assign]  # its own names
@@ -218,7 +220,7 @@ def test_a_relative_that_lacks_a_field_is_driven(field: str) -> None:
     assert episode.car.moving
 
 
-def test_a_firmware_that_changes_ends_the_drive() -> None:
+def test_firmware_change_ends_drive() -> None:
     episode = ready("ugv_rover")
     episode.ask(Drive(Motion.FORWARD, 5.0))
     episode.run(1.0)

@@ -70,7 +70,7 @@ def test_slow_link_buffers_a_bounded_amount() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
-def test_a_lossy_link_loses_its_share(share: float) -> None:
+def test_lossy_link_loses_its_share(share: float) -> None:
     link = line()
     link.lossy(share, tuple(Direction), until=5.0)
     data = random.Random(3).randbytes(10_000)
@@ -99,7 +99,7 @@ def test_loss_depends_on_seed_and_own_bytes() -> None:
 
 
 @pytest.mark.parametrize("way", list(Direction))
-def test_one_way_is_lossy_or_closed_the_other_is_not(way: Direction) -> None:
+def test_lossy_or_closed_way_leaves_other_way_whole(way: Direction) -> None:
     for fault in ("lossy", "closed"):
         link = line()
         if fault == "lossy":
@@ -113,7 +113,7 @@ def test_one_way_is_lossy_or_closed_the_other_is_not(way: Direction) -> None:
         assert both(link, FRAME, 2.0) == (FRAME, FRAME)
 
 
-def test_an_echo_comes_back_and_is_heard() -> None:
+def test_echo_link_returns_and_delivers_bytes() -> None:
     link = line()
     link.echo(until=2.0)
     link.from_host(FRAME, 1.0)
@@ -141,7 +141,7 @@ def test_write_is_cut_after_given_bytes(count: int, piece: int) -> None:
     assert not link.cut
 
 
-def test_a_cut_waits_for_what_comes_before_it() -> None:
+def test_cut_waits_for_bytes_before_it() -> None:
     link = line()
     link.slow(1.0, until=inf)
     link.cut_next(5)
@@ -153,7 +153,7 @@ def test_a_cut_waits_for_what_comes_before_it() -> None:
 
 
 @pytest.mark.parametrize("rate", [10.0, 960.0, 1e6])
-def test_a_firehose_has_its_rate_whenever_it_is_looked_at(rate: float) -> None:
+def test_firehose_has_its_rate_at_any_poll_times(rate: float) -> None:
     link, moments = line(), random.Random(2)
     link.flood(Flood.NOISE, rate, 1.0, until=6.0)
     out, now = b"", 1.0
@@ -165,14 +165,14 @@ def test_a_firehose_has_its_rate_whenever_it_is_looked_at(rate: float) -> None:
     assert len(set(out)) > min(200, len(out) / 3)
 
 
-def test_a_firehose_that_nobody_looked_at_is_no_mountain() -> None:
+def test_unread_firehose_is_bounded() -> None:
     link = line()
     link.flood(Flood.NOISE, 1e6, 0.0, until=inf)
     assert sum(map(len, link.to_host(3600.0))) == 1_000_000
     assert link.next_event() == pytest.approx(3600.0 + FLOOD_INTERVAL_S)
 
 
-def test_a_frame_that_never_ends_is_one_frame() -> None:
+def test_endless_flood_frame_is_one_frame() -> None:
     link = line()
     link.flood(Flood.FRAME, 10_000, 0.0, until=2.0)
     out = b"".join(b"".join(link.to_host(n / 1000)) for n in range(2001))
@@ -184,7 +184,7 @@ def test_a_frame_that_never_ends_is_one_frame() -> None:
     assert any("overlong" in str(event) for event in decoder.feed(out, 0.0))
 
 
-def test_a_cut_link_forgets_what_is_under_way() -> None:
+def test_cleared_link_forgets_bytes_in_transit() -> None:
     link = line()
     link.slow(0.1, until=inf)
     both(link, FRAME, 0.0)

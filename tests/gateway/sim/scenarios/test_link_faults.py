@@ -41,7 +41,7 @@ def driving(simulation: Simulation, name: str = "red") -> bool:
     return bool(simulation.cars[name].truth.driving)
 
 
-async def test_a_stuck_pty_lets_a_write_wait_and_loses_nothing(cars: Simulation) -> None:
+async def test_stuck_pty_blocks_write_and_loses_nothing(cars: Simulation) -> None:
     with open_port(cars, write_timeout=0.2) as port:
         await cars.inflict(Fault(FaultKind.STUCK, "red"))
         with pytest.raises(serial.SerialTimeoutException):
@@ -58,7 +58,7 @@ async def test_a_stuck_pty_lets_a_write_wait_and_loses_nothing(cars: Simulation)
         await until(lambda: not driving(cars), "what waited has arrived")
 
 
-async def test_a_stuck_pty_is_stuck_after_a_drop_too(cars: Simulation) -> None:
+async def test_stuck_pty_stays_stuck_after_link_drop(cars: Simulation) -> None:
     await cars.inflict(Fault(FaultKind.STUCK, "red"))
     await cars.inflict(Fault(FaultKind.LINK_DROP, "red"))
     await cars.inflict(Fault(FaultKind.LINK_DROP, "red", for_s=0))
@@ -80,7 +80,7 @@ async def test_bytes_to_stuck_tcp_car_arrive_later(cars: Simulation) -> None:
     writer.close()
 
 
-async def test_a_deaf_car_takes_what_is_written_and_drops_it(cars: Simulation) -> None:
+async def test_deaf_car_drops_written_bytes(cars: Simulation) -> None:
     with open_port(cars) as port:
         await cars.inflict(Fault(FaultKind.DEAF, "red"))
         port.write(RUN)
@@ -91,7 +91,7 @@ async def test_a_deaf_car_takes_what_is_written_and_drops_it(cars: Simulation) -
         await until(lambda: driving(cars), "it hears again")
 
 
-async def test_a_mute_car_obeys(cars: Simulation) -> None:
+async def test_mute_car_obeys_and_sends_nothing(cars: Simulation) -> None:
     with open_port(cars) as port:
         await cars.inflict(Fault(FaultKind.MUTE, "red"))
         while port.read(4096):  # until no byte is in transit, because a reset would not discard it
@@ -105,7 +105,7 @@ async def test_a_mute_car_obeys(cars: Simulation) -> None:
         await until(lambda: data.extend(port.read(4096)) or len(data) > 100, "it is heard again")
 
 
-async def test_an_echoing_car_sends_back_what_comes_and_obeys(cars: Simulation) -> None:
+async def test_echoing_car_returns_bytes_and_obeys(cars: Simulation) -> None:
     with open_port(cars) as port:
         await cars.inflict(Fault(FaultKind.ECHO, "red"))
         port.write(RUN)
@@ -114,7 +114,7 @@ async def test_an_echoing_car_sends_back_what_comes_and_obeys(cars: Simulation) 
         await until(lambda: driving(cars), "it drives")
 
 
-async def test_a_slow_link_trickles_both_ways(cars: Simulation) -> None:
+async def test_slow_link_delays_both_ways(cars: Simulation) -> None:
     with open_port(cars) as port:
         await cars.inflict(Fault(FaultKind.SLOW, "red", factor=0.1))
         begun = time.monotonic()
@@ -126,7 +126,7 @@ async def test_a_slow_link_trickles_both_ways(cars: Simulation) -> None:
         await cars.inflict(Fault(FaultKind.SLOW, "red", for_s=0))
 
 
-async def test_a_firehose_over_either_link(cars: Simulation) -> None:
+async def test_firehose_over_tcp_and_pty(cars: Simulation) -> None:
     reader, writer = await asyncio.open_connection(*address(cars))
     with open_port(cars) as port:
         # Read all the time, until enough bytes have arrived. Without a reader, a full terminal loses bytes.
@@ -142,7 +142,7 @@ async def test_a_firehose_over_either_link(cars: Simulation) -> None:
     writer.close()
 
 
-async def test_a_frame_that_never_ends(cars: Simulation) -> None:
+async def test_firehose_of_one_endless_frame(cars: Simulation) -> None:
     with open_port(cars, "plain") as port:
         await cars.inflict(Fault(FaultKind.FIREHOSE, "plain", for_s=2 * PATIENCE, rate=50_000, flood=Flood.FRAME))
         data = bytearray()
@@ -152,7 +152,7 @@ async def test_a_frame_that_never_ends(cars: Simulation) -> None:
         assert rest.count(b"0") > 4_000
 
 
-async def test_a_lossy_link_to_the_car_only(cars: Simulation) -> None:
+async def test_lossy_link_to_car_keeps_readings_whole(cars: Simulation) -> None:
     with open_port(cars) as port:
         await cars.inflict(Fault(FaultKind.LOSSY, "red", share=0.5, ways=(Direction.TO_CAR,)))
         port.write(b"x" * 400)
@@ -209,7 +209,7 @@ async def test_cut_on_pty_is_unplugged_cable_once(cars: Simulation, tmp_path: Pa
         assert path.is_symlink()
 
 
-async def test_a_path_stays_and_the_device_behind_it_is_another(cars: Simulation, tmp_path: Path) -> None:
+async def test_rename_keeps_path_with_new_device(cars: Simulation, tmp_path: Path) -> None:
     path = tmp_path / "red"
     before = path.readlink()
     await cars.inflict(Fault(FaultKind.RENAME, "red", for_s=0.05))
@@ -221,7 +221,7 @@ async def test_a_path_stays_and_the_device_behind_it_is_another(cars: Simulation
         await until(lambda: driving(cars), "it is the same car")
 
 
-async def test_a_path_goes_and_another_comes(cars: Simulation, tmp_path: Path) -> None:
+async def test_rename_to_other_path(cars: Simulation, tmp_path: Path) -> None:
     named: list[str] = []
     cars.cars["red"].on_renamed = lambda car: named.append(car.url)
     await cars.inflict(Fault(FaultKind.RENAME, "red", for_s=0.05, path=str(tmp_path / "other")))
@@ -266,7 +266,7 @@ async def test_path_taken_during_outage_is_told(cars: Simulation, tmp_path: Path
     assert "is there already" in told[0]
 
 
-async def test_the_remote_drives_a_running_car_and_the_truth_tells(cars: Simulation) -> None:
+async def test_ir_remote_drives_running_car_and_truth_tells(cars: Simulation) -> None:
     car = cars.cars["red"]
     seen: list[tuple[int, int]] = []
     car.watchers.append(lambda changed: seen.append((changed.truth.motor_left, changed.truth.motor_right)))

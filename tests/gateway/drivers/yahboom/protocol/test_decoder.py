@@ -70,7 +70,7 @@ def test_bad_frames_are_counted_by_cause_and_next_decodes(row: dict[str, str]) -
     assert good.raw == GOOD
 
 
-def test_every_cause_has_a_test() -> None:
+def test_causes_are_all_tested() -> None:
     seen = {cause for row in BAD for cause in row["causes"].split()}
     # Other tests cover the causes overlong and out of range: the first needs many bytes, the second rejects fields.
     assert seen | {Cause.OVERLONG, Cause.OUT_OF_RANGE} == set(Cause)
@@ -105,7 +105,7 @@ def test_feed_sees_a_silence_that_no_tick_told_it_of() -> None:
     assert isinstance(second, Sensors)
 
 
-def test_an_end_that_comes_late_is_no_junk() -> None:
+def test_late_frame_end_is_no_junk() -> None:
     decoder = Decoder()
     decoder.feed(FOLLOWING, 1.0)
     assert len(decoder.tick(1.06)) == 1
@@ -116,7 +116,7 @@ def test_an_end_that_comes_late_is_no_junk() -> None:
 
 
 @pytest.mark.parametrize("cut", range(1, len(FOLLOWING)))
-def test_the_rest_of_a_frame_may_be_late(cut: int) -> None:
+def test_rest_of_frame_may_be_late(cut: int) -> None:
     decoder = Decoder()
     decoder.feed(FOLLOWING[:cut], 1.0)
     assert decoder.tick(1.49) == []
@@ -276,7 +276,7 @@ def kinds(events: list[Event]) -> list[tuple[str, bytes]]:
 
 
 @pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r"])
-def test_a_whole_line_of_text_is_no_damage(end: bytes) -> None:
+def test_whole_line_of_text_is_no_damage(end: bytes) -> None:
     line = b"EXEC:F" + end
     events = Decoder().feed(GOOD + line + GOOD + b"\r\n" + line + b"Motor on, 3 A" + end + GOOD, 1.0)
     expected = [GOOD, line, GOOD, line, b"Motor on, 3 A" + end, GOOD]
@@ -307,7 +307,7 @@ def test_text_and_damage_runs_are_separate_events() -> None:
     assert kinds(events) == expected
 
 
-def test_the_rest_of_a_line_is_no_line() -> None:
+def test_rest_of_damaged_line_is_no_text() -> None:
     decoder = Decoder()
     decoder.feed(b"\xff\xfe", 1.0)
     assert kinds(decoder.feed(b"EXEC:F\r\nEXEC:F\r\n", 2.0) + decoder.end()) == [
@@ -330,7 +330,7 @@ def test_line_after_frame_is_whole(size: int) -> None:
     assert kinds(events + decoder.end()) == [("no_start", b"\xff\xfe"), ("sensors", GOOD), ("text", b"EXEC:F\r\n")]
 
 
-def test_the_rest_of_a_frame_is_no_line() -> None:
+def test_rest_of_damaged_frame_is_no_text() -> None:
     decoder = Decoder()
     decoder.feed(b"$4WD,CSB1", 1.0)
     assert kinds(decoder.feed(b"hello\r\n", 2.0) + decoder.end())[-1] == ("no_start", b"hello")
@@ -338,7 +338,7 @@ def test_the_rest_of_a_frame_is_no_line() -> None:
     assert [kind for kind, _ in kinds(Decoder().feed(overlong + GOOD, 1.0))] == ["overlong", "no_start", "sensors"]
 
 
-def test_a_recorded_line_of_text_decodes_again() -> None:
+def test_recorded_text_decodes_to_same_events() -> None:
     decoder = Decoder()
     for raw in (b"\xff", b"EXEC:F\r\n", b"hello", b"EXEC:F\r\n"):
         assert kinds(decoder.feed(raw, 1.0) + decoder.end()) == [("text" if b"EXEC" in raw else "no_start", raw)]

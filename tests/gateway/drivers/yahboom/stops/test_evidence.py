@@ -104,7 +104,7 @@ class EvidenceWatch:
         ([], []),
     ],
 )
-def test_one_pause_around_a_mode00(reports: list[float], found: list[Finding]) -> None:
+def test_pause_around_mode00_is_found_once(reports: list[float], found: list[Finding]) -> None:
     watch = EvidenceWatch()
     before = [at for at in reports if at <= 10.0]
     watch.reports(*before)
@@ -148,7 +148,7 @@ def test_pause_with_second_block_may_be_longer() -> None:
     assert watch.reports(14.6) == [SETTLING], "neither was in doubt"
 
 
-def test_the_frame_that_is_judged_is_the_last_one() -> None:
+def test_only_last_stop_frame_is_judged() -> None:
     """A general stop after `MODE00` could become a motion on its way, and nothing would show it."""
     watch = EvidenceWatch()
     assert watch.pause(10.0) is PAUSE
@@ -289,7 +289,7 @@ def test_stop_frame_behind_own_block_shows_nothing() -> None:
     assert list(watch.learned.echo.intervals) == [INTERVAL_S] * 6, "the interval of that frame is no measure"
 
 
-def test_a_loop_that_slept_has_perhaps_taken_reports_late() -> None:
+def test_reset_times_forgets_pause_after_loop_slept() -> None:
     watch = EvidenceWatch()
     assert watch.pause(10.0) is PAUSE
     watch.reports(13.5)
@@ -309,7 +309,7 @@ def test_slow_link_has_more_time_from_second_try() -> None:
 
 
 @pytest.mark.parametrize("without", range(3))
-def test_a_ranging_without_echo_takes_longer_and_shows_nothing(without: int) -> None:
+def test_report_without_echo_shows_no_stop(without: int) -> None:
     watch = EvidenceWatch()
     found = watch.reports(9.5, frame=SILENT if without == 0 else ECHO)
     watch.closed(10.0)
@@ -323,7 +323,7 @@ def test_a_ranging_without_echo_takes_longer_and_shows_nothing(without: int) -> 
 # ---------------------------------------------------------------------- what is learned
 
 
-def test_nothing_is_judged_before_the_rhythm_is_known() -> None:
+def test_pause_is_unjudged_before_rhythm_is_known() -> None:
     watch = EvidenceWatch(Learned())
     watch.closed(9.9)
     assert watch.reports(11.0) == [UNJUDGED]
@@ -350,7 +350,7 @@ def test_three_delays_that_agree_are_the_block_of_this_car(block_s: float) -> No
     assert watch.learned.shows is Shows.YES
 
 
-def test_a_car_that_never_reacts_cannot_show_a_stop() -> None:
+def test_car_that_never_reacts_cannot_show_stop() -> None:
     watch = EvidenceWatch(known(shows=Shows.UNKNOWN))
     found_out = []
     for number in range(UNREACTED):
@@ -367,7 +367,7 @@ def test_car_that_showed_stop_stays_able_to_show() -> None:
     assert watch.learned.shows is Shows.YES
 
 
-def test_a_whistle_that_delays_a_report_is_a_reaction_too() -> None:
+def test_whistle_that_delays_report_counts_as_reaction() -> None:
     watch = EvidenceWatch(known(shows=Shows.UNKNOWN))
     for number in range(UNREACTED - 1):
         watch.pause(10.0 + 5 * number, 0.0)
@@ -443,7 +443,7 @@ def test_only_blocking_car_shows_left_mode_by_one_report(shows: Shows) -> None:
     assert watch.reports(11.5) == [PAUSE]
 
 
-def test_a_general_stop_after_mode00_leaves_the_report_unjudged() -> None:
+def test_general_stop_after_mode00_leaves_left_mode_unshown() -> None:
     watch = tracking(10.0)
     watch.closed(10.0)
     watch.evidence.on_other_frame()
@@ -484,7 +484,7 @@ def test_mode_shape_long_after_mode00_shows_the_opposite() -> None:
     assert watch.reports(12.3)[-1] is not SHOWN
 
 
-def test_one_damaged_reading_is_no_mode_that_was_seen() -> None:
+def test_single_reading_confirms_no_mode() -> None:
     watch = EvidenceWatch()
     watch.evidence.on_mode_opened(Mode.TRACKING, 0.0, silent=False, shown=True)
     watch.evidence.on_reading(event(TRACKING, 9.0))
@@ -511,7 +511,7 @@ def test_old_reports_of_slow_link_do_not_show_left_mode(delay_s: float) -> None:
 
 
 @given(st.floats(0.0, ARDUINO.shortest_opening_s - LATE_S - 0.01))
-def test_a_report_without_the_silence_of_opening_shows_nothing(quiet_s: float) -> None:
+def test_report_without_silence_of_opening_shows_no_stop(quiet_s: float) -> None:
     watch = silent()
     watch.reports(12.0 - quiet_s if quiet_s else 12.0)
     watch.closed(10.5)
@@ -573,7 +573,7 @@ ROWS = [
 
 
 @pytest.mark.parametrize(("case", "situation", "words"), ROWS, ids=[row[0].name for row in ROWS])
-def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words: str) -> None:
+def test_stop_case_decides_phase_and_basis(case: StopCase, situation: Callable[[], Pair], words: str) -> None:
     pair = situation()
     phase, basis, said = ended(pair)
     shown = case in (cases.LEFT_SHAPE, cases.LEFT_SILENT, cases.MANUAL)
@@ -585,7 +585,7 @@ def test_a_row_of_the_table(case: StopCase, situation: Callable[[], Pair], words
     assert shown or pair.control.driver.model.rest_case is case
 
 
-def test_a_soft_stop_shows_nothing() -> None:
+def test_soft_stop_is_only_sent() -> None:
     """The row `soft`: the release of a drive, and the rest after it, are only sent."""
     pair = driven()
     assert ended(pair, Drive(Motion.STOP)) == (Phase.SENT, Basis.SENT, cases.SOFT.why("red"))
@@ -602,7 +602,7 @@ def test_frame_at_shown_rest_leaves_it_sent() -> None:
     assert pair.control.driver.model.rest_case is cases.ACTED
 
 
-def test_every_row_is_played() -> None:
+def test_stop_cases_are_all_tested() -> None:
     elsewhere = {cases.SOFT, cases.ACTED, cases.WRONG_PLATFORM, cases.NOT_KNOWN}  # test_wrong_platform.py
     assert {row[0] for row in ROWS} | elsewhere == set(cases.CASES)
 
