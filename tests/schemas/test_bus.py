@@ -35,7 +35,7 @@ def endpoint() -> Iterator[str]:
     assert hub.wait(processes.PATIENCE_S) == 0
 
 
-def test_a_publication_carries_header_number_encoding_and_time(endpoint: str) -> None:
+def test_publication_has_header_seq_encoding_and_time(endpoint: str) -> None:
     with bus.Bus.open(endpoint) as sender, bus.Bus.open(endpoint) as receiver:
         got: list[bus.Sample] = []
         receiver.subscribe("fleet/**", got.append)
@@ -159,7 +159,7 @@ def test_tokens_of_all_fleets_while_watching_one(endpoint: str) -> None:
                 assert second == ["two/red"]
 
 
-def test_a_hub_is_started_once_and_ends_by_itself() -> None:
+def test_hub_is_started_once_and_ends_when_idle() -> None:
     where = free_endpoint()
     idle = subprocess.Popen([sys.executable, "-m", "schemas.bus.hub", "--endpoint", where, "--idle-s", "3"])
     wait_for(lambda: bus.accepts(where))
@@ -193,14 +193,14 @@ def test_hub_listens_on_network_only_on_request(host: str, loopback: bool) -> No
             bus.check_listening(where, insecure_lan=False)
 
 
-def test_a_hub_on_a_network_is_wrong_use() -> None:
+def test_hub_on_network_is_wrong_use() -> None:
     command = [sys.executable, "-m", "schemas.bus.hub", "--endpoint", "tcp/0.0.0.0:7447"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=processes.PATIENCE_S, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith("hub: a hub at tcp/0.0.0.0:7447 would let everyone")
 
 
-def test_a_killed_hub_comes_back_and_everything_with_it() -> None:
+def test_sessions_reconnect_to_restarted_hub() -> None:
     where = free_endpoint()
     with bus.Bus.open(where, start_hub=True) as car, bus.Bus.open(where) as watcher:
         car.token("fleet/red")
@@ -231,7 +231,7 @@ def test_hub_of_another_computer_that_does_not_answer_is_not_an_idle_fleet() -> 
         bus.Bus.open(where)
 
 
-def test_a_listener_that_is_no_zenoh_router_is_named() -> None:
+def test_foreign_listener_is_named_as_no_router() -> None:
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -248,7 +248,7 @@ def test_bad_endpoints_are_wrong_use(bad: str) -> None:
         bus.resolve_endpoint(bad)
 
 
-def test_the_endpoint_is_the_argument_then_the_variable_then_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resolve_endpoint_prefers_argument_then_variable(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("FLEET_ENDPOINT", raising=False)
     assert bus.resolve_endpoint() == "tcp/127.0.0.1:7447"
     monkeypatch.setenv("FLEET_ENDPOINT", "tcp/[::1]:7000")
@@ -279,7 +279,7 @@ async def test_handover_keeps_order_bounded_and_counts_drops() -> None:
     assert taken == [*range(10), 99]
 
 
-async def test_a_handover_lets_others_have_their_turn() -> None:
+async def test_handover_lets_other_handovers_have_turns() -> None:
     """With two full handovers, the second one used to wait until the first one was empty."""
     taken: list[str] = []
     loop = asyncio.get_running_loop()
@@ -307,7 +307,7 @@ async def test_backlog_takes_one_at_a_time_and_refuses_overflow() -> None:
     thread.join()
 
 
-async def test_the_latest_of_each_name_comes_once() -> None:
+async def test_latest_coalesces_values_by_name() -> None:
     batches: list[dict[str, bool]] = []
     latest: bus.Latest[bool] = bus.Latest(limit=3)
     latest("early", True)
@@ -324,7 +324,7 @@ async def test_the_latest_of_each_name_comes_once() -> None:
     assert latest.dropped == 1
 
 
-async def test_a_handover_of_the_newest_leaves_out_what_waited_longest() -> None:
+async def test_newest_handover_drops_oldest_values() -> None:
     taken: list[int] = []
     handover = bus.Handover(asyncio.get_running_loop(), taken.append, limit=10, newest=True)
     thread = threading.Thread(target=lambda: [handover(number) for number in range(25)])
@@ -335,7 +335,7 @@ async def test_a_handover_of_the_newest_leaves_out_what_waited_longest() -> None
     assert taken == list(range(15, 25))
 
 
-def test_a_reply_in_json_is_protobufs_mapping() -> None:
+def test_json_reply_is_protobuf_mapping() -> None:
     text = messages.to_json(pb.Line(car="red", left_inner=True, seq=7))
     assert '"left_inner":true' in text
     assert '"seq":"7"' in text

@@ -29,11 +29,11 @@ def client(cars: Cars) -> Iterator[Fleet]:
         yield opened
 
 
-def test_the_cars_are_those_with_a_token(client: Fleet) -> None:
+def test_cars_are_those_with_token(client: Fleet) -> None:
     assert client.cars() == ["blue", "green", "red"]
 
 
-def test_a_pose_from_outside_is_answered_by_the_gateway(client: Fleet, cars: Cars) -> None:
+def test_published_pose_is_answered_by_gateway(client: Fleet, cars: Cars) -> None:
     assert client.get("red/sensor/pose") == [], "nobody has measured one"
     client.publish_pose("red", x_m=1.5, y_m=-0.5, heading_rad=7.0, frame="map", xy_std_m=0.02)
 
@@ -67,13 +67,13 @@ def test_a_pose_from_outside_is_answered_by_the_gateway(client: Fleet, cars: Car
         {"car": "Red"},
     ],
 )
-def test_a_pose_that_is_none_is_refused(wrong: dict[str, Any], client: Fleet) -> None:
+def test_invalid_pose_is_refused(wrong: dict[str, Any], client: Fleet) -> None:
     fields: dict[str, Any] = {"car": "red", "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0, **wrong}
     with pytest.raises(ValueError, match=r"is not allowed|is not a car"):
         client.publish_pose(**fields)
 
 
-def test_a_command_is_carried_out_and_seen_in_the_car(client: Fleet, cars: Cars) -> None:
+def test_led_command_is_carried_out(client: Fleet, cars: Cars) -> None:
     outcome = client.car("red").led(255, 0, 16)
     assert (outcome.ok, outcome.phase) == (True, "sent")
     wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["led"] == "#ff0010", "the LED is so")
@@ -101,7 +101,7 @@ def test_stop_supersedes_drive_and_waits_until_complete(client: Fleet, cars: Car
     assert [(each.ok, each.phase) for each in ended] == [(False, "superseded")]  # type: ignore[attr-defined]  # Outcome
 
 
-def test_one_stop_reaches_every_car(client: Fleet) -> None:
+def test_stop_reaches_every_car(client: Fleet) -> None:
     def stopped() -> list[Outcome] | None:
         outcomes = client.stop()
         return outcomes if all(each.ok for each in outcomes) else None
@@ -115,13 +115,13 @@ def test_one_stop_reaches_every_car(client: Fleet) -> None:
     ]
 
 
-def test_a_name_in_place_of_a_list_is_one_car(client: Fleet) -> None:
+def test_stop_of_str_is_one_car(client: Fleet) -> None:
     """A str is an iterable of letters. `stop("red")` must not ask the cars r, e and d, and leave red driving."""
     (outcome,) = client.stop("red")
     assert (outcome.car, outcome.ok) == ("red", True)
 
 
-def test_a_missing_car_keeps_no_other_from_its_command(client: Fleet) -> None:
+def test_missing_car_does_not_delay_others(client: Fleet) -> None:
     outcomes = client.ask(led_request(1, 2, 3), ["red", "purple", "blue"])
     assert [(each.car, each.ok, each.phase) for each in outcomes] == [
         ("blue", True, "sent"),
@@ -132,7 +132,7 @@ def test_a_missing_car_keeps_no_other_from_its_command(client: Fleet) -> None:
     assert "blue, green, red" in outcomes[1].words
 
 
-def test_a_refusal_carries_its_reason_and_words(client: Fleet) -> None:
+def test_refusal_has_reason_and_words(client: Fleet) -> None:
     outcome = client.car("green").light("pink")
     assert (outcome.ok, outcome.phase, outcome.reason) == (False, "rejected", "bad_value")
     assert "white, red" in outcome.words
@@ -163,7 +163,7 @@ def test_client_that_disconnects_while_driving_leaves_no_car_driving(cars: Cars)
 
 
 @pytest.mark.parametrize("duration_s", [0, -1, 3600.01, float("nan"), float("inf")])
-def test_a_drive_out_of_range_is_refused_here(client: Fleet, duration_s: float) -> None:
+def test_drive_duration_out_of_range_is_refused_by_client(client: Fleet, duration_s: float) -> None:
     with pytest.raises(ValueError, match="more than 0 and at most 3600 s"):
         client.car("red").drive("forward", duration_s)
 
@@ -199,7 +199,7 @@ def test_readings_have_key_time_and_value(client: Fleet) -> None:
         client.get("red//x")
 
 
-def test_a_watch_gives_what_is_published_and_ends_when_closed(client: Fleet) -> None:
+def test_watch_yields_readings_until_closed(client: Fleet) -> None:
     with client.watch("*/state/health") as readings:
         seen = set()
         for reading in readings:
@@ -210,7 +210,7 @@ def test_a_watch_gives_what_is_published_and_ends_when_closed(client: Fleet) -> 
     assert (readings.dropped, readings.unreadable) == (0, 0)
 
 
-async def test_the_async_client_does_the_same(cars: Cars) -> None:
+async def test_async_client_commands_and_watches(cars: Cars) -> None:
     async with AsyncFleet(cars.endpoint, sender="eve") as client:
         assert await client.cars() == ["blue", "green", "red"]
         one, other = await asyncio.gather(client.car("red").whistle(), client.car("blue").led(0, 0, 9))
@@ -287,7 +287,7 @@ def test_hung_gateway_differs_from_late_answer(
     assert caplog.messages[0].startswith("fine, hung: ")
 
 
-async def test_a_stop_waits_for_no_command_that_nobody_answers(
+async def test_stop_does_not_wait_for_unanswered_command(
     cars: Cars, gateway: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fleet.client.client.OVERLOAD_ANSWER_TIMEOUT_S", 600.0)
@@ -414,7 +414,7 @@ def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
     assert len(outcomes) == 1
 
 
-def test_a_closed_fleet_says_that_it_is_closed(cars: Cars) -> None:
+def test_closed_fleet_raises_bus_error(cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="ann") as client:
         red = client.car("red")
     uses: list[Callable[[], object]] = [
@@ -430,7 +430,7 @@ def test_a_closed_fleet_says_that_it_is_closed(cars: Cars) -> None:
             use()
 
 
-def test_no_fleet_and_bad_names_are_told_apart() -> None:
+def test_missing_fleet_and_bad_names_have_own_errors() -> None:
     with pytest.raises(NoFleet):
         Fleet(free_endpoint())
     with pytest.raises(BadEndpoint):

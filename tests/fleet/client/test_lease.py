@@ -122,7 +122,7 @@ def test_late_publication_of_old_state_is_no_news() -> None:
     assert ours.lost.endswith("by bob (person)"), "a gateway that began anew counts anew"
 
 
-def test_a_refusal_says_who_has_it() -> None:
+def test_lease_monitor_is_lost_by_refused_command() -> None:
     ours = LeaseMonitor("red", Sender("bot"))
     ours.on_outcome(Outcome("red", ok=False, phase="rejected", reason="unsupported", words="no arm"))
     assert not ours.lost
@@ -152,7 +152,7 @@ def holder(cars: Cars, car: str) -> str:
     return found
 
 
-def test_a_leased_car_drives_and_is_given_back(fleet: Fleet, cars: Cars) -> None:
+def test_lease_block_drives_and_releases_car(fleet: Fleet, cars: Cars) -> None:
     with fleet.car("red").lease() as car:
         assert asked(lambda: car.drive("forward", 0.5)).basis in ("sent", "shown")
         assert holder(cars, "red") == "bot"
@@ -170,7 +170,7 @@ def test_lease_is_renewed_until_block_ends(fleet: Fleet, cars: Cars) -> None:
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit])
-def test_the_car_stops_on_any_exit(fleet: Fleet, cars: Cars, error: type[BaseException]) -> None:
+def test_lease_exit_by_exception_stops_car(fleet: Fleet, cars: Cars, error: type[BaseException]) -> None:
     def block() -> None:
         with fleet.car("blue").lease() as car:
             asked(lambda: car.drive("forward", LONG_S, wait=False))
@@ -184,7 +184,7 @@ def test_the_car_stops_on_any_exit(fleet: Fleet, cars: Cars, error: type[BaseExc
     assert not cars.state("safety", "blue").HasField("hold"), "a coordinator may go on"
 
 
-def test_a_mode_ends_with_the_block(fleet: Fleet, cars: Cars) -> None:
+def test_lease_exit_ends_mode(fleet: Fleet, cars: Cars) -> None:
     with fleet.car("red").lease() as car:
         car.mode("tracking")
         wait_for(lambda: cars.sim.say({"car": "red", "ask": "truth"})["mode"] == "tracking", "red tracks")
@@ -203,7 +203,7 @@ def test_refused_command_raises_not_carried_out(fleet: Fleet, cars: Cars) -> Non
         pass
 
 
-def test_a_person_takes_a_car_and_keeps_it(fleet: Fleet, cars: Cars) -> None:
+def test_lease_taken_by_person_is_lost(fleet: Fleet, cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="mia", kind="person") as mia:
 
         def block() -> None:
@@ -226,7 +226,7 @@ def go_on(car: Car) -> None:
 
 
 @pytest.mark.parametrize("late", ["nothing", "what is published", "what is asked for, too"])
-def test_a_drive_that_another_ends_says_who_did(fleet: Fleet, cars: Cars, late: str) -> None:
+def test_lease_lost_during_drive_names_person(fleet: Fleet, cars: Cars, late: str) -> None:
     """`late`: the publications of its gateway arrive too late, or the gateway also answers only after some seconds."""
     paused = threading.Timer(PAUSED_S, lambda: cars.gateways["blue"].popen.send_signal(signal.SIGCONT))
 
@@ -286,7 +286,7 @@ def test_between_persons_only_who_takes_it_gets_it(cars: Cars) -> None:
         assert holder(cars, "green") == ""
 
 
-async def test_a_cancelled_task_stops_its_car(cars: Cars) -> None:
+async def test_lease_of_cancelled_task_stops_car(cars: Cars) -> None:
     async with AsyncFleet(cars.endpoint, sender="eve") as fleet:
 
         async def drive() -> None:
@@ -320,7 +320,7 @@ def test_readings_by_field(cars: Cars, fleet: Fleet) -> None:
     assert list(watch) == []
 
 
-def test_the_package_is_imported_without_what_it_does_not_need(cars: Cars) -> None:
+def test_import_fleet_loads_neither_zenoh_nor_asyncio(cars: Cars) -> None:
     looked = "import sys, fleet; print(sorted({'zenoh', 'google.protobuf', 'asyncio'} & set(sys.modules)))"
     process = cars.start("-c", looked)
     assert process.wait() == 0, process.stderr

@@ -115,7 +115,7 @@ def test_no_answer_says_whether_there_is_a_gateway(alive: bool, words: str) -> N
     assert "after 10 s" in progress.outcome.words
 
 
-def test_a_car_whose_records_come_is_not_without_an_answer() -> None:
+def test_query_timeout_is_ignored_while_records_come() -> None:
     progress = told(Until.STOPPED, [("event", "asked", 0.0), ("event", "sent", 0.5)])
     progress.on_query_timeout(110.0)
     assert progress.outcome is None
@@ -201,7 +201,7 @@ def test_lost_gateway_is_reported_after_grace_second() -> None:
         ("lease", "", ("sent", "", "", ""), "done"),
     ],
 )
-def test_the_text_of_each_outcome(verb: str, detail: str, event: tuple[str, str, str, str], text: str) -> None:
+def test_outcome_text_by_verb_and_reason(verb: str, detail: str, event: tuple[str, str, str, str], text: str) -> None:
     until = {"drive": Until.OVER, **dict.fromkeys(STOP_VERBS, Until.STOPPED)}
     progress = Progress("red", until.get(verb, Until.SENT), 100.0, 1.0, verb=verb, detail=detail)
     phase, reason, words, basis = event
@@ -223,9 +223,7 @@ def test_reason_of_waiting_is_known_until_frame_is_sent() -> None:
     assert progress.waits == ""
 
 
-def test_a_person_is_told_once_what_a_command_waits_for(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_waiting_command_is_explained_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     monkeypatch.setattr(command_tracker, "WAIT_SAID_S", 0.0)
     pending = PendingCommand("it", mode_request("tracking"), ["red"], ["red"], tuple, lambda car: None)
     for phase, words in (("queued", "opens later"), ("queued", "opens later"), ("sent", "")):
@@ -236,7 +234,7 @@ def test_a_person_is_told_once_what_a_command_waits_for(
     assert [record.getMessage() for record in caplog.records] == ["red: opens later"]
 
 
-def test_a_car_that_was_not_asked_has_no_outcome() -> None:
+def test_car_that_was_not_asked_has_no_outcome() -> None:
     """Its gateway got the command from that of the named car, which forwards the end of an e-stop of the fleet."""
     pending = PendingCommand("it", resume_request(["x"]), ["red", "blue"], ["red"], tuple, lambda car: None)
     for car, phase in (("blue", "rejected"), ("red", "sent")):
@@ -246,7 +244,7 @@ def test_a_car_that_was_not_asked_has_no_outcome() -> None:
     assert [(each.car, each.ok) for each in pending.outcomes()] == [("red", True)]
 
 
-def test_each_verb_has_a_text() -> None:
+def test_verbs_have_effect_texts() -> None:
     assert set(EFFECTS) == {*COMMANDS, "release", "estop_fleet", "*"}
 
 
@@ -279,14 +277,14 @@ def test_late_events_of_drive_are_no_extension() -> None:
     assert (progress.outcome.ok, progress.outcome.phase) == (True, "complete")
 
 
-def test_the_first_last_word_stays() -> None:
+def test_first_final_answer_stays() -> None:
     progress = told(Until.SENT, [("answer", "rejected", 0.0), ("event", "sent", 0.0)])
     progress.on_query_failed("nothing", 105.0)
     assert progress.outcome is not None
     assert (progress.outcome.phase, progress.outcome.reason) == ("rejected", "held")
 
 
-def test_a_foreign_answer_does_not_replace_that_of_the_gateway() -> None:
+def test_foreign_answer_does_not_replace_gateway_answer() -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
     progress.on_foreign_answer("another program answered for red: no result")
     assert progress.outcome is None
@@ -301,7 +299,7 @@ def test_a_foreign_answer_does_not_replace_that_of_the_gateway() -> None:
     "ends",
     [lambda p: p.on_query_failed("It ended. Look at the car.", 101.0), lambda p: p.on_query_timeout(110.0)],
 )
-def test_a_foreign_answer_explains_why_no_other_came(ends: Callable[[Progress], None]) -> None:
+def test_foreign_answer_explains_missing_answer(ends: Callable[[Progress], None]) -> None:
     progress = Progress("red", Until.STOPPED, 100.0)
     progress.on_foreign_answer("another program answered for red: no result")
     ends(progress)
@@ -320,7 +318,7 @@ def test_a_foreign_answer_explains_why_no_other_came(ends: Callable[[Progress], 
         (("expired", "expired", "red was busy", ""), False, ""),
     ],
 )
-def test_a_drive_is_ok_if_it_was_sent_whole(last: tuple[str, str, str, str], ok: bool, basis: str) -> None:
+def test_drive_outcome_is_ok_if_sent_whole(last: tuple[str, str, str, str], ok: bool, basis: str) -> None:
     progress = Progress("red", Until.OVER, 100.0, 3.0, verb="drive", detail="3.0 s")
     progress.on_event("sent", "", "", 0.0, 100.1)
     assert progress.outcome is None, "the motion was sent, and the drive goes on"

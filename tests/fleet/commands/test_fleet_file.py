@@ -122,7 +122,7 @@ def simulate(tmp_path: Path, endpoint: str) -> Iterator[Callable[..., GatewayPro
 # ------------------------------------------------------------------ check
 
 
-def test_a_bad_file_is_told_of_whole(command: Command, tmp_path: Path) -> None:
+def test_check_reports_all_faults_of_file(command: Command, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text("cars:\n  red: {lnk: COM1}\n  Red: {link: x}\n")
     done = command("check")
     assert (done.returncode, done.stdout) == (2, "")
@@ -134,7 +134,7 @@ def test_a_bad_file_is_told_of_whole(command: Command, tmp_path: Path) -> None:
     assert [(each["line"], each["column"], each["field"]) for each in told][1] == (2, 9, "cars.red.lnk")
 
 
-def test_no_file(command: Command) -> None:
+def test_check_without_file_is_wrong_use(command: Command) -> None:
     done = command("check", "other.yaml")
     assert done.returncode == 2
     assert "other.yaml: error: " in done.stderr
@@ -178,7 +178,7 @@ def test_ports_are_looked_at_and_left_alone(command: Command, port: Port, tcp: T
 
 
 @pytest.mark.parametrize("platform", ["arduino", "ugv_rover"])
-def test_a_bridge_is_connected_to_and_told_nothing(
+def test_check_connects_to_bridge_and_sends_nothing(
     command: Command, tcp: TcpCar, tmp_path: Path, platform: str
 ) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{platform: {platform}, link: '{tcp.link}'}}}}")
@@ -189,7 +189,7 @@ def test_a_bridge_is_connected_to_and_told_nothing(
     assert (tcp.connections, tcp.received) == (1, [])
 
 
-def test_a_port_that_somebody_has(command: Command, port: Port, tmp_path: Path) -> None:
+def test_check_names_process_that_locks_port(command: Command, port: Port, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{link: {port.path}}}}}")
     fcntl.flock(port.device, fcntl.LOCK_EX)  # as gateways do
     done = command("check")
@@ -202,7 +202,7 @@ def test_a_port_that_somebody_has(command: Command, port: Port, tmp_path: Path) 
         assert "not known here" in done.stdout
 
 
-def test_a_car_with_a_gateway_is_left_to_it(command: Command, endpoint: str, tmp_path: Path) -> None:
+def test_check_leaves_car_with_gateway_alone(command: Command, endpoint: str, tmp_path: Path) -> None:
     fleet = FleetProcesses(endpoint, tmp_path)
     try:
         _, [link] = fleet.simulate("red:arduino:pty")
@@ -407,7 +407,7 @@ def test_unknown_links_blink_and_person_names_them(
     )
 
 
-def test_no_unknown_link(command: Command, port: Port, tmp_path: Path) -> None:
+def test_bind_without_new_car_fails(command: Command, port: Port, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text(f"cars: {{red: {{link: {port.path}}}}}")
     done = command("bind", "--for", "0.5", "--link", port.path)
     assert done.returncode == 1
@@ -433,7 +433,7 @@ def test_no_unknown_link(command: Command, port: Port, tmp_path: Path) -> None:
         ("cars:\n  red: &r {link: COM1}\n", "red", 'cars:\n  red: &r {link: "COM9"}\n'),
     ],
 )
-def test_the_text_is_cut_not_made_anew(text: str, car: str, after: str | None) -> None:
+def test_set_link_edits_text_in_place(text: str, car: str, after: str | None) -> None:
     if after is None:
         with pytest.raises((CannotEdit, BadFile), match=re.escape(car)):
             set_link(text, Path("f.yaml"), car, "COM9")
@@ -441,7 +441,7 @@ def test_the_text_is_cut_not_made_anew(text: str, car: str, after: str | None) -
         assert set_link(text, Path("f.yaml"), car, "COM9") == after
 
 
-def test_a_link_that_is_another_cars_is_not_written() -> None:
+def test_set_link_refuses_link_of_other_car() -> None:
     with pytest.raises(BadFile, match="same port"):
         set_link("cars: {red: {link: COM9}, blue: {link: COM2}}", Path("f.yaml"), "blue", "com9")
 

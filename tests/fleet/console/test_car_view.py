@@ -16,7 +16,7 @@ def view_of(platform: str = "arduino", capabilities: tuple[str, ...] | None = No
     return view
 
 
-def test_a_reading_that_is_stale_is_left_out() -> None:
+def test_stale_reading_is_left_out() -> None:
     view = view_of()
     view.on_message("red", "sensor/range", pb.Range(range_m=1.234), 10.0)
     view.on_message("red", "sensor/line", pb.Line(left_inner=True), 12.0)
@@ -27,20 +27,20 @@ def test_a_reading_that_is_stale_is_left_out() -> None:
     assert car["line"] == [False, True, False, False]
 
 
-def test_no_echo_is_no_distance() -> None:
+def test_reading_without_echo_has_no_distance() -> None:
     view = view_of()
     view.on_message("red", "sensor/range", pb.Range(no_echo=True), 10.0)
     assert view.as_list(10.0)[0]["range_m"] is None
 
 
-def test_the_motors_rest_on_what_their_gateway_says() -> None:
+def test_motors_have_basis_of_their_gateway() -> None:
     view = view_of()
     assert view.as_list(0.0)[0]["motors"] == {"state": "unknown", "basis": ""}
     view.on_message("red", "state/safety", pb.Safety(motors="off", motors_basis="sent"), 10.0)
     assert view.as_list(10.0)[0]["motors"] == {"state": "off", "basis": "sent"}
 
 
-def test_each_sender_has_its_name() -> None:
+def test_hold_lease_and_estop_name_their_senders() -> None:
     view = view_of()
     safety = pb.Safety(hold=pb.Hold(by="us"), lease=pb.Lease(holder="mia", kind="person"))
     safety.estops.add(id="e1", by="us", why="smoke", scope="fleet")
@@ -53,7 +53,7 @@ def test_each_sender_has_its_name() -> None:
     )
 
 
-def test_a_gateway_that_has_gone_says_for_how_long() -> None:
+def test_gone_gateway_has_duration_and_past_claims() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
     view.on_message("red", "state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
@@ -70,7 +70,7 @@ def test_a_gateway_that_has_gone_says_for_how_long() -> None:
     assert (car["mode"]["asked"], car["mode"]["verdict"]) == ("unknown", "assumed")
 
 
-def test_a_link_without_a_gateway_is_not_online() -> None:
+def test_link_without_gateway_is_not_online() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
     view.on_message("red", "state/link", pb.Link(state="online"), 10.0)
@@ -108,7 +108,7 @@ def test_returning_gateway_does_not_revive_old_claims() -> None:
     assert told() == ("lost", "assumed", ""), "late messages of the last one"
 
 
-def test_a_gateway_that_hangs_claims_nothing_for_long() -> None:
+def test_hung_gateway_loses_its_claims() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)
     view.on_message("red", "state/safety", pb.Safety(motors="off", motors_basis="shown"), 10.0)
@@ -132,7 +132,7 @@ def test_stale_card_shows_age_and_no_link(after_s: float, silent_s: int | None) 
     assert ("silent_s" in car, car["link"]["state"]) == (False, "online")
 
 
-def test_a_car_that_cannot_show_its_stops_says_so() -> None:
+def test_car_that_cannot_show_stops_is_marked() -> None:
     view = view_of()
     health = pb.Health(platform="arduino", shows_stops="no", shows_stops_words="its reports do not react to frames")
     view.on_message("red", "state/health", health, 1.0)
@@ -140,7 +140,7 @@ def test_a_car_that_cannot_show_its_stops_says_so() -> None:
     assert (car["shows"], car["shows_words"]) == ("no", "its reports do not react to frames")
 
 
-def test_a_car_is_offered_what_its_platform_and_gateway_can() -> None:
+def test_abilities_are_those_of_platform_and_gateway() -> None:
     (arduino,) = view_of().as_list(0.0)
     assert "tracking" in arduino["modes"]
     assert "Arduino cars" in arduino["cannot"]["arm"]
@@ -154,7 +154,7 @@ def test_a_car_is_offered_what_its_platform_and_gateway_can() -> None:
     assert unknown["can"] == ()
 
 
-def test_a_trend_needs_half_a_minute_and_ignores_noise() -> None:
+def test_battery_trend_needs_half_a_minute_and_ignores_noise() -> None:
     falling, steady = BatteryTrend(), BatteryTrend()
     for second in range(120):
         assert falling.words == "" or second > 30
@@ -163,7 +163,7 @@ def test_a_trend_needs_half_a_minute_and_ignores_noise() -> None:
     assert (falling.words, steady.words) == ("falling", "steady")
 
 
-def test_the_last_event_and_the_ledger() -> None:
+def test_last_event_is_shown_and_ledger_is_bounded() -> None:
     view = view_of()
     car = view.look_up("red")
     for number in range(100):
@@ -217,7 +217,7 @@ def test_longest_silent_car_is_evicted_never_a_heard_one() -> None:
     assert "junk0" not in view.names
 
 
-def test_a_car_that_the_fleet_lists_always_has_a_place() -> None:
+def test_listed_car_always_has_place() -> None:
     view = view_of()
     invent(view, MAX_OTHER_CARS, 1.0)
     view.list_cars(["red", "black", "not a name"])
@@ -236,7 +236,7 @@ def test_a_car_that_the_fleet_lists_always_has_a_place() -> None:
 
 
 @pytest.mark.parametrize("ranks", [("lead", "person"), ("person", "lead"), ("lead", "person", "person")])
-def test_the_pause_that_is_shown_is_the_one_that_binds(ranks: tuple[str, ...]) -> None:
+def test_binding_pause_is_shown(ranks: tuple[str, ...]) -> None:
     """Only a lead ends a lead's pause, whoever has paused after it."""
     view, safety = view_of(), pb.Safety(motors="off")
     for number, rank in enumerate(ranks):
@@ -259,7 +259,7 @@ def test_of_pauses_of_one_rank_the_newest_is_shown() -> None:
 
 
 @pytest.mark.parametrize(("off_s", "named"), [(-240, True), (240, True), (2, False)])
-def test_a_wrong_clock_of_a_gateway_is_named_but_not_that_of_a_recording(off_s: int, named: bool) -> None:
+def test_wrong_clock_is_named_for_gateway_not_for_recording(off_s: int, named: bool) -> None:
     def findings(*, live: bool) -> str:
         view = FleetView(lambda *_: "#ff0000")
         view.on_presence(["red"], 9.0)

@@ -18,7 +18,7 @@ def book_with_press(*, at: float = 10.0, cars: tuple[str, ...] = RED) -> tuple[P
     return book, tick
 
 
-def test_a_press_lives_while_new_ticks_are_echoed() -> None:
+def test_press_lives_while_new_ticks_are_echoed() -> None:
     book, _ = book_with_press()
     for step in range(1, 50):
         now = 10.0 + step * 0.1
@@ -47,7 +47,7 @@ def test_late_echo_does_not_count_even_before_expiry() -> None:
     assert len(book.expire(10.0 + MAX_ECHO_GAP_S + 0.1)) == 1
 
 
-def test_the_echo_of_an_old_tick_does_not_count() -> None:
+def test_echo_of_old_tick_does_not_count() -> None:
     """A restored link delivers a burst, and so does a resumed page."""
     book, first = book_with_press()
     book.tick(10.1)
@@ -56,7 +56,7 @@ def test_the_echo_of_an_old_tick_does_not_count() -> None:
     assert book.echo(1, 1, 99, 10.1) is None, "a tick that was never issued"
 
 
-def test_a_press_with_an_old_tick_never_begins() -> None:
+def test_press_with_old_tick_is_refused() -> None:
     book = PressBook()
     tick = book.tick(10.0)
     with pytest.raises(PressRefused, match="slow"):
@@ -64,7 +64,7 @@ def test_a_press_with_an_old_tick_never_begins() -> None:
     assert book.alive == []
 
 
-def test_a_release_that_overtakes_its_press_ends_it() -> None:
+def test_release_that_overtakes_its_press_ends_it() -> None:
     book = PressBook()
     tick = book.tick(10.0)
     assert book.release(1, 1) is None
@@ -72,7 +72,7 @@ def test_a_release_that_overtakes_its_press_ends_it() -> None:
         book.begin(1, 1, RED, "forward", tick, 10.0)
 
 
-def test_the_release_of_an_earlier_press_ends_no_later_one() -> None:
+def test_release_of_earlier_press_ends_no_later_one() -> None:
     book, tick = book_with_press()
     book.begin(1, 2, RED, "back", tick, 10.0)
     assert book.release(1, 1) is None
@@ -89,7 +89,7 @@ def test_two_pages_never_drive_one_car() -> None:
     assert book.begin(2, 3, ("blue",), "back", tick, 10.0)
 
 
-def test_a_stop_ends_every_press_and_the_next_one_waits() -> None:
+def test_stop_ends_presses_and_delays_next() -> None:
     book, tick = book_with_press()
     assert len(book.on_stop(10.1)) == 1
     tick = book.tick(10.2)
@@ -100,7 +100,7 @@ def test_a_stop_ends_every_press_and_the_next_one_waits() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from(["tick", "echo", "late echo", "release", "expire"]), st.floats(0.0, 0.5))))
-def test_nothing_revives_a_press(steps: list[tuple[str, float]]) -> None:
+def test_ended_press_never_revives(steps: list[tuple[str, float]]) -> None:
     """In any order of events, no echo counts after a gap, and no press outlives a gap."""
     book, newest = book_with_press()
     now, last_echo, over = 10.0, 10.0, False
@@ -142,7 +142,7 @@ def test_computer_sleep_ends_presses_and_old_ticks_do_not_count() -> None:
     ("person", "holder", "takes"),
     [("teacher", "pupil", True), ("pupil", "teacher", False), ("teacher", "head", False), ("pupil", "other", False)],
 )
-def test_only_lead_takes_car_of_person(person: str, holder: str, *, takes: bool) -> None:
+def test_press_of_person_is_taken_by_lead_only(person: str, holder: str, *, takes: bool) -> None:
     book = PressBook()
     tick = book.tick(10.0)
     book.begin(1, 1, ("red", "blue"), "forward", tick, 10.0, person=holder, people=PEOPLE)
@@ -175,7 +175,7 @@ def test_mode_or_release_ends_no_press_of_higher_rank(person: str, holder: str, 
     assert bool(book.alive) is not ends
 
 
-def test_no_press_outlives_the_bus() -> None:
+def test_bus_loss_ends_presses() -> None:
     book, tick = book_with_press()
     assert [press.client for press in book.on_bus_lost()] == [1]
     assert book.echo(1, 1, tick, 10.1) is None

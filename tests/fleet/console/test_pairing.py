@@ -62,12 +62,12 @@ def test_new_pairing_code_keeps_other_and_old_ones_expire() -> None:
 
 
 @pytest.mark.parametrize("person", [PagePerson("Mia M"), PagePerson(""), PagePerson("mia", "king"), PagePerson("a/b")])
-def test_a_code_is_for_a_name_and_a_rank(person: PagePerson) -> None:
+def test_pairing_code_needs_valid_name_and_rank(person: PagePerson) -> None:
     with pytest.raises(ValueError):
         PeopleBook().issue("K7QF3MXP", person, NOW)
 
 
-def test_a_code_is_for_the_people_of_the_fleet() -> None:
+def test_pairing_code_is_for_listed_people() -> None:
     book = replace(PeopleBook(), people=("mia", "teacher"))
     assert len(book.issue("K7QF3MXP", MIA, NOW).codes) == 1
     with pytest.raises(UnknownPerson, match="teacher"):
@@ -78,7 +78,7 @@ def test_a_code_is_for_the_people_of_the_fleet() -> None:
         replace(book, people=()).issue("K7QF3MXP", MIA, NOW)
 
 
-def test_a_lead_is_whom_the_fleet_makes_one_also_later() -> None:
+def test_paired_lead_is_lead_only_while_fleet_file_says_so() -> None:
     lead, stranger = PagePerson("teacher", "lead"), PagePerson("mia", "lead")
     assert PeopleBook().issue("K7QF3MXP", stranger, NOW).codes, "that fleet lists nobody"
     book = replace(PeopleBook(), people=("mia", "teacher"), leads=("teacher",))
@@ -115,7 +115,7 @@ def test_neither_codes_nor_cookies_are_stored() -> None:
 
 
 @given(st.lists(st.tuples(CODES, st.text(max_size=80)), max_size=5))
-def test_a_book_survives_a_restart(pairs: list[tuple[str, str]]) -> None:
+def test_people_book_survives_restart(pairs: list[tuple[str, str]]) -> None:
     book = PeopleBook(address="https://192.168.1.5:7443")
     for index, (code, device) in enumerate(pairs):
         book = book.issue(code, PagePerson("teacher", "lead"), NOW)
@@ -125,7 +125,7 @@ def test_a_book_survives_a_restart(pairs: list[tuple[str, str]]) -> None:
 
 
 @given(st.text())
-def test_a_damaged_book_is_refused(text: str) -> None:
+def test_damaged_people_book_is_refused(text: str) -> None:
     with pytest.raises(BadBook):
         PeopleBook.of_text(text)
     with pytest.raises(BadBook):
@@ -226,7 +226,7 @@ def test_revoked_device_is_unknown_and_loses_open_code(name: str) -> None:
     assert (book.redeem("ABCDEFGH", "c", "d", "", NOW) is None) is (name == "mia")
 
 
-def test_a_thousand_guesses_of_one_address_take_days() -> None:
+def test_pairing_guesses_of_one_address_take_days() -> None:
     limit, now = GuessLimit(), 0.0
     for _ in range(1000):
         now += limit.wait_s("10.0.0.9", now)
@@ -251,7 +251,7 @@ def test_waits_grow_up_to_a_limit_and_are_forgotten(pauses: list[int]) -> None:
     assert limit.wait_s("a", now) == 0
 
 
-def test_the_memory_of_guesses_is_bounded() -> None:
+def test_memory_of_guesses_is_bounded() -> None:
     limit = GuessLimit()
     for number in range(pairing.MAX_GUESSERS + 50):
         limit.on_wrong(str(number), 0.0)
@@ -326,7 +326,7 @@ def test_connections_are_limited_per_device() -> None:
     assert limit.on_paired("phone", "calm")
 
 
-def test_a_flood_of_messages_is_counted_not_logged() -> None:
+def test_log_limit_counts_suppressed_messages() -> None:
     limit = LogLimit(10.0)
     assert [limit.words("refused", now) for now in (0.0, 1.0, 9.9)] == ["refused", None, None]
     assert limit.words("refused", 10.0) == "refused (2 more since the last message)"

@@ -167,7 +167,7 @@ def answer(port: int, verb: str, path: str, body: str | None = None, **headers: 
     return found
 
 
-def test_a_stop_stops_and_strangers_are_refused(stage: ServerStage) -> None:
+def test_loopback_stop_works_and_foreign_origin_is_refused(stage: ServerStage) -> None:
     console, own = stage.console, stage.console.address
     status, page = answer(console.port, "GET", "/")
     assert status == 200
@@ -180,7 +180,7 @@ def test_a_stop_stops_and_strangers_are_refused(stage: ServerStage) -> None:
     wait_for(lambda: not stage.judge.driving, "red stands")
 
 
-def test_a_stranger_on_the_network_gets_nothing(stage: ServerStage) -> None:
+def test_unpaired_network_device_gets_nothing(stage: ServerStage) -> None:
     stranger = NetworkDevice(stage.lan_port)
     assert stranger.ask("GET", "/") == (303, b"")
     assert b"Pair this device" in stranger.ask("GET", "/pair")[1]
@@ -198,7 +198,7 @@ def test_a_stranger_on_the_network_gets_nothing(stage: ServerStage) -> None:
     assert stage.judge.driving
 
 
-def test_a_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> None:
+def test_paired_device_has_its_person_and_stops_cars(stage: ServerStage) -> None:
     device = NetworkDevice(stage.lan_port)
     assert device.pair(stage.code("mia"))["ok"]
     for flag in ("; HttpOnly", "; Secure", "; SameSite=Strict", "; Path=/"):
@@ -344,7 +344,7 @@ def book_file(stage: ServerStage) -> PeopleFile:
         return PeopleFile(people_path(stage.fleet.endpoint, "fleet"))
 
 
-def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -> None:
+def test_recordings_and_plans_need_a_lead(stage: ServerStage) -> None:
     driver, teacher = stage.device("mia"), stage.device("teacher", "--rank", "lead")
     own = {"Origin": stage.console.address, "Cookie": loopback_cookie(stage)}
     plan = "roles:\n  guide: {mode: trackin}\n"  # a good one would start
@@ -367,7 +367,7 @@ def test_only_a_lead_starts_and_stops_recordings_and_plans(stage: ServerStage) -
     assert driver.ask("GET", "/sessions")[0] == 200
 
 
-def test_a_ping_is_answered_with_its_number(stage: ServerStage) -> None:
+def test_ping_is_answered_with_its_number(stage: ServerStage) -> None:
     with stage.device("mia").socket() as page:
         page.send(json.dumps({"t": "ping", "id": 7}))
         assert next_message(page, "pong")["id"] == 7
@@ -457,7 +457,7 @@ def press_until_closed(page: ClientConnection) -> None:
 
 
 @pytest.mark.parametrize("how", ["command", "page"])
-def test_a_revoked_device_is_out_at_once(stage: ServerStage, how: str) -> None:
+def test_revoked_device_is_disconnected_at_once(stage: ServerStage, how: str) -> None:
     device, lead = stage.device("thief"), stage.device("teacher", "--rank", "lead")
     with device.socket() as page:
         driving = hold(stage, page)
@@ -483,7 +483,7 @@ def read_to_the_end(page: ClientConnection) -> None:
             page.recv(timeout=10)
 
 
-def test_an_expired_cookie_opens_nothing_and_still_stops(stage: ServerStage) -> None:
+def test_expired_cookie_opens_nothing_and_still_stops(stage: ServerStage) -> None:
     device = stage.device("old")
     file = book_file(stage)
     text = file.read().as_text()
@@ -526,7 +526,7 @@ def test_guesses_get_nothing_and_are_slowed_down(stage: ServerStage) -> None:
     assert not NetworkDevice(stage.lan_port, source="127.0.0.4").pair(code)["ok"], "a replay"
 
 
-def test_a_cookie_at_two_addresses_is_logged(stage: ServerStage) -> None:
+def test_cookie_at_two_addresses_is_logged(stage: ServerStage) -> None:
     device = stage.device("owner")
     thief = NetworkDevice(stage.lan_port, source="127.0.0.5")
     thief.cookie = device.cookie
@@ -843,7 +843,7 @@ def cars_of(page: ClientConnection) -> set[str]:
 
 
 @pytest.mark.parametrize("kind", ["take", "give_back", "do"])
-def test_a_car_that_nobody_knows_is_refused_without_a_query(stage: ServerStage, kind: str) -> None:
+def test_unknown_car_is_refused_without_query(stage: ServerStage, kind: str) -> None:
     with stage.device("giver").socket() as page:
         for number in range(10):
             page.send(json.dumps({"t": kind, "id": number, "verb": "whistle", "cars": ["red", f"ghost{number}"]}))
@@ -964,7 +964,7 @@ def test_request_flood_costs_no_other_device_nor_local_computer(stage: ServerSta
         assert answer(stage.console.port, "GET", "/hello")[0] == 200
 
 
-def test_a_flood_fills_no_log(stage: ServerStage) -> None:
+def test_flood_of_plot_queries_fills_no_log(stage: ServerStage) -> None:
     asked: list[str] = []
 
     def refuse(query: zenoh.Query) -> bool:
@@ -1052,7 +1052,7 @@ def test_192_half_requests_of_one_cookie_lock_nobody_out(stage: ServerStage) -> 
     assert "Traceback" not in stage.log()
 
 
-def test_one_device_has_so_many_pages_and_others_still_come(stage: ServerStage) -> None:
+def test_pages_of_one_device_are_limited(stage: ServerStage) -> None:
     greedy, calm = stage.device("mia"), stage.device("calm")
     with contextlib.ExitStack() as pages:
         opened = [pages.enter_context(greedy.socket()) for _ in range(MAX_PAGES_OF_DEVICE)]
@@ -1142,7 +1142,7 @@ def connect_and_leave(stage: ServerStage, times: int) -> None:
             hasty.sendall((b"", b"GET /hello HT", b"\x16\x03\x01")[number % 3])
 
 
-def test_each_port_speaks_its_own_protocol(stage: ServerStage) -> None:
+def test_http_and_https_ports_refuse_each_other(stage: ServerStage) -> None:
     with socket.create_connection(("127.0.0.1", stage.lan_port), timeout=30) as plain:
         plain.sendall(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{stage.lan_port}\r\n\r\n".encode())
         assert b"HTTP" not in plain.recv(4096)
@@ -1171,7 +1171,7 @@ def test_second_console_names_first_and_other_port_works(stage: ServerStage) -> 
     assert second.process.end() == 0
 
 
-def test_a_page_starts_a_plan_where_none_runs(stage: ServerStage) -> None:  # the last test: its coordinator stays
+def test_page_starts_plan_if_none_runs(stage: ServerStage) -> None:  # the last test: its coordinator stays
     teacher = stage.device("teacher", "--rank", "lead")
     plan = "roles:\n  guide: {mode: manual}\n"
     status, text = teacher.ask("POST", "/plan/set", plan)

@@ -69,7 +69,7 @@ def asked(sessions: Path, sql: str) -> list[dict[str, object]]:
     return list(Catalog(sessions).query(sql).to_pylist())
 
 
-def test_a_question_reaches_every_session_and_says_which(sessions: Path) -> None:
+def test_query_reaches_every_session_and_names_it(sessions: Path) -> None:
     rows = asked(
         sessions, "SELECT session, car, count(*) n, min(range_m) nearest FROM sensor_range GROUP BY ALL ORDER BY 1"
     )
@@ -98,14 +98,14 @@ def test_driver_column_names_person_without_process(sessions: Path) -> None:
         assert rows == [{column: "ann", "n": 4}], "each drive is of another process"
 
 
-def test_the_person_of_a_sender_is_that_of_all_texts(sessions: Path) -> None:
+def test_person_of_sender_in_sql_is_name_of(sessions: Path) -> None:
     catalog = Catalog(sessions)
     for sender in ("tom@vm-535", "tom", "tom@a@b", "@vm-535", "Zoë@x", None, ""):
         (row,) = catalog.query("SELECT person_of(?) AS person", [sender]).to_pylist()
         assert row["person"] == (name_of(sender) if sender else None)
 
 
-def test_every_topic_has_a_view_also_without_a_message(sessions: Path) -> None:
+def test_view_exists_for_topic_without_messages(sessions: Path) -> None:
     catalog = Catalog(sessions)
     found = catalog.tables()
     assert {view_name(name) for name in TOPICS} <= set(found)
@@ -115,7 +115,7 @@ def test_every_topic_has_a_view_also_without_a_message(sessions: Path) -> None:
 
 
 @pytest.mark.parametrize("sql", ["SELECT nothing FROM sensor_range", "nonsense", "SELECT * FROM nowhere", ""])
-def test_a_bad_question_is_one_line(sessions: Path, sql: str) -> None:
+def test_bad_query_is_refused_in_one_line(sessions: Path, sql: str) -> None:
     if not sql:
         assert Catalog(sessions).query("SELECT 1 WHERE false").num_rows == 0
         return
@@ -146,7 +146,7 @@ def test_tables_are_made_once_and_again_for_grown_session(sessions: Path) -> Non
     assert asked(sessions, "SELECT count(*) n FROM sensor_range WHERE session = 'one'") == [{"n": 6}]
 
 
-def test_a_damaged_session_is_named_and_its_rest_counts(sessions: Path) -> None:
+def test_damaged_session_is_named_and_others_are_read(sessions: Path) -> None:
     file = sessions / "two" / "0001.mcap"
     file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
     (sessions / "broken").mkdir()
@@ -162,7 +162,7 @@ def describe(session: Path, **values: Any) -> None:
 
 
 @pytest.mark.parametrize("asked_before", [False, True])
-def test_a_session_that_lacks_messages_is_named_as_by_find(sessions: Path, *, asked_before: bool) -> None:
+def test_session_that_lacks_messages_is_named_as_by_find(sessions: Path, *, asked_before: bool) -> None:
     if asked_before:
         assert not Catalog(sessions).damage
     describe(sessions / "one", messages=9000)
@@ -188,13 +188,13 @@ def test_session_asked_while_recording_is_named_once_cut(sessions: Path, monkeyp
     assert tables.exists()
 
 
-def test_a_mark_makes_no_tables_anew(sessions: Path) -> None:
+def test_mark_keeps_cached_tables(sessions: Path) -> None:
     before = tables_of(sessions / "one").directory
     describe(sessions / "one", marks=[{"time": "2026-01-01T00:00:00Z", "text": "a cat", "by": "mia"}])
     assert tables_of(sessions / "one").directory == before
 
 
-def test_the_descriptions_are_read_once(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_session_descriptions_are_read_once(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
 
     def noting(session: Path) -> str:
@@ -217,7 +217,7 @@ def test_the_descriptions_are_read_once(sessions: Path, monkeypatch: pytest.Monk
     assert read == [one, two, one, two], "its tables were made anew"
 
 
-def test_a_session_that_is_deleted_meanwhile_is_left_out(sessions: Path) -> None:
+def test_session_deleted_during_query_is_left_out(sessions: Path) -> None:
     catalog = Catalog(sessions)
     shutil.rmtree(sessions / "two")
     assert catalog.query("SELECT DISTINCT car FROM sensor_range").to_pylist() == [{"car": "red"}]
@@ -263,7 +263,7 @@ def query(*arguments: object, cwd: Path | None = None) -> "subprocess.CompletedP
     return in_process.fleet("query", *arguments, cwd=cwd)
 
 
-def test_the_command_answers_as_a_table_csv_and_json(sessions: Path) -> None:
+def test_query_command_prints_table_csv_and_json(sessions: Path) -> None:
     sql = "SELECT car, range_m FROM sensor_range WHERE range_m < 0.6 ORDER BY range_m"
     assert query(sql, sessions).stdout.split() == ["car", "range_m", "red", "0.25", "red", "0.5"]
     assert query(sql, sessions, "--csv").stdout.splitlines() == ["car,range_m", "red,0.25", "red,0.5"]
@@ -281,7 +281,7 @@ def test_wrong_use_is_code_2(sessions: Path, arguments: tuple[str, ...]) -> None
     assert query(*arguments, cwd=sessions.parent).returncode == 2
 
 
-def test_no_sessions_are_no_traceback(tmp_path: Path) -> None:
+def test_query_without_sessions_has_no_traceback(tmp_path: Path) -> None:
     assert query("SELECT 1", tmp_path / "nowhere").returncode == 1
     (tmp_path / "empty").mkdir()
     assert query("SELECT count(*) FROM sensor_range", tmp_path / "empty").stdout.split()[-1] == "0"
@@ -296,7 +296,7 @@ def named(done: "subprocess.CompletedProcess[str]", sessions: Path) -> set[str]:
     return {line.partition(":")[0] for line in done.stderr.splitlines()} & {each.name for each in sessions.iterdir()}
 
 
-def test_the_exit_code_is_that_of_find(sessions: Path) -> None:
+def test_query_exit_code_is_that_of_find(sessions: Path) -> None:
     file = sessions / "two" / "0001.mcap"
     whole = file.read_bytes()
     (sessions / "broken").mkdir()
@@ -315,7 +315,7 @@ def test_the_exit_code_is_that_of_find(sessions: Path) -> None:
 @pytest.mark.parametrize(
     "arguments", [("query", "FROM sensor_range"), ("find", "range_m < 5"), ("sessions",), ("sessions", "at", "14:05")]
 )
-def test_a_directory_that_cannot_be_listed_is_one_line(sessions: Path, arguments: tuple[str, ...], closed: str) -> None:
+def test_unlistable_directory_is_one_line(sessions: Path, arguments: tuple[str, ...], closed: str) -> None:
     in_process.fleet(*arguments, sessions)  # without rights, Python could perhaps not import what this imports
     place, locked = sessions, sessions
     if closed == "..":
@@ -404,7 +404,7 @@ def test_messages_that_cannot_be_decoded_are_named(
 
 
 @pytest.mark.parametrize("others", [True, False])
-def test_a_session_of_another_schema_has_the_columns_of_ours(sessions: Path, *, others: bool) -> None:
+def test_session_of_other_schema_has_our_columns(sessions: Path, *, others: bool) -> None:
     if not others:
         shutil.rmtree(sessions / "one")
         shutil.rmtree(sessions / "two")
@@ -439,13 +439,13 @@ def test_any_name_is_a_name(sessions: Path, name: str) -> None:
     assert rows == [{"session": name}]
 
 
-def test_one_file_is_a_session_and_has_its_name(sessions: Path) -> None:
+def test_single_file_is_session_of_its_name(sessions: Path) -> None:
     (sessions / "two" / "0001.mcap").rename(sessions / "lone.mcap")
     shutil.rmtree(sessions / "two")
     assert asked(sessions, "SELECT DISTINCT session FROM sensor_range WHERE car = 'blue'") == [{"session": "lone.mcap"}]
 
 
-def test_an_interrupted_session_that_grows_while_it_is_asked(sessions: Path) -> None:
+def test_interrupted_session_may_grow_during_query(sessions: Path) -> None:
     whole = (sessions / "one" / "0001.mcap").read_bytes()
     live = sessions / "live"
     live.mkdir()
@@ -461,7 +461,7 @@ def test_an_interrupted_session_that_grows_while_it_is_asked(sessions: Path) -> 
     assert len([*live.glob(f"{TABLES_PREFIX}*")]) == 1
 
 
-def test_a_deleted_session_does_not_appear_again(sessions: Path) -> None:
+def test_table_cache_does_not_recreate_deleted_session(sessions: Path) -> None:
     shutil.rmtree(sessions / "two")
     with pytest.raises(NoSession):
         tables_of(sessions / "two")
@@ -524,9 +524,7 @@ def test_ctrl_c_leaves_nothing_half_made(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not MAY_MOUNT, reason="needs the right to mount")
 @pytest.mark.parametrize("both", [False, True])
-def test_a_disk_that_fills_costs_no_row_of_an_answer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, both: bool
-) -> None:
+def test_full_disk_costs_no_row_of_query(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, both: bool) -> None:
     with disk("really full", tmp_path) as full:
         elsewhere = full.root / ".tmp" if both else tmp_path / "tmp"
         elsewhere.mkdir(parents=True)
@@ -573,7 +571,7 @@ def test_tables_that_can_be_written_nowhere_are_no_answer(
         assert no_tables(sessions / "two")
 
 
-def test_no_temporary_directory_is_one_line(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_temporary_directory_is_one_line(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(sessions / "nowhere"))
     done = query("SELECT count(*) n FROM sensor_range", sessions)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
@@ -592,7 +590,7 @@ def test_tables_that_another_question_deletes_are_made_again(sessions: Path, mon
 
 
 @pytest.mark.skipif(not MAY_MOUNT, reason="needs the right to mount")
-def test_a_disk_that_is_read_only_is_asked(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_only_disk_can_be_queried(sessions: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     elsewhere = sessions.parent / "tmp"
     elsewhere.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(elsewhere))
@@ -606,7 +604,7 @@ def test_a_disk_that_is_read_only_is_asked(sessions: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.soak
-def test_a_million_rows_are_written_a_block_at_a_time(sessions: Path) -> None:
+def test_million_rows_are_written_in_blocks(sessions: Path) -> None:
     sql = "SELECT range AS n FROM range(1000000)"
     for format_option in ("--csv", "--json"):
         command = [sys.executable, "-c", LIMITED, "query", sql, str(sessions), format_option]
@@ -664,7 +662,7 @@ def test_all_views_are_there_for_a_question_that_lists_them(sessions: Path) -> N
         assert "sensor_range_context" in str(asked(sessions, sql))
 
 
-def test_a_question_that_is_too_large_is_no_wrong_use(sessions: Path) -> None:
+def test_too_large_query_fails_without_wrong_use(sessions: Path) -> None:
     catalog = Catalog(sessions)
     with pytest.raises(QueryFailed):
         catalog.query("SELECT list(range) FROM range(2000000000)")

@@ -88,7 +88,7 @@ def test_bit_flip_is_told_and_loses_one_chunk_at_most(original: Original, tmp_pa
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_every_bit_flip_is_told_and_loses_one_chunk_at_most(original: Original, tmp_path: Path) -> None:
+def test_bit_flip_is_reported_and_loses_one_chunk_at_most(original: Original, tmp_path: Path) -> None:
     for at in range(len(original.data)):
         flipped_it_loses_its_own_chunk_at_most(original, at, range(8), tmp_path)
 
@@ -125,7 +125,7 @@ def test_bit_flip_without_index_loses_one_chunk_at_most(original: Original, tmp_
 
 
 @pytest.mark.soak
-def test_every_byte_and_length_without_index(original: Original, tmp_path: Path) -> None:
+def test_damage_without_index_loses_own_chunk_at_most(original: Original, tmp_path: Path) -> None:
     without_an_index_it_loses_its_own_chunk_at_most(original, 1, tmp_path / "x.mcap")
 
 
@@ -193,7 +193,7 @@ def test_reader_reads_largest_recorded_messages(tmp_path: Path) -> None:
         assert salvage.only_cut or not salvage.damage
 
 
-def test_a_file_in_which_nothing_was_recorded_is_whole(tmp_path: Path) -> None:
+def test_empty_recording_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "0001.mcap"
     Segment(path, {}).finish({})
     salvage = McapReader(path)
@@ -217,7 +217,7 @@ def test_damaged_chunk_is_named_with_place_time_and_cause(original: Original, tm
 
 
 @pytest.mark.parametrize("field", ["length of the record", "size of the records", "length of the data"])
-def test_an_absurd_length_is_not_believed(original: Original, tmp_path: Path, field: str) -> None:
+def test_absurd_chunk_length_is_not_believed(original: Original, tmp_path: Path, field: str) -> None:
     begin, _ = original.chunks[2]
     at = (
         begin + {"length of the record": 1, "size of the records": 9 + 16, "length of the data": 9 + 16 + 12 + 8}[field]
@@ -229,7 +229,7 @@ def test_an_absurd_length_is_not_believed(original: Original, tmp_path: Path, fi
         judge(original, data[:-8], at, tmp_path / "x.mcap")
 
 
-def test_an_absurd_length_of_any_record_is_not_believed(original: Original, tmp_path: Path) -> None:
+def test_absurd_record_length_is_not_believed(original: Original, tmp_path: Path) -> None:
     at = 8
     while at < len(original.data) - 8:
         (length,) = struct.unpack_from("<Q", original.data, at + 1)
@@ -240,7 +240,7 @@ def test_an_absurd_length_of_any_record_is_not_believed(original: Original, tmp_
         at += 9 + length
 
 
-def test_a_chunk_that_grows_when_uncompressed_is_not_followed(tmp_path: Path) -> None:
+def test_chunk_with_huge_uncompressed_size_is_skipped(tmp_path: Path) -> None:
     for compression in (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE):
         out = io.BytesIO()
         writer = Writer(out, compression=compression)
@@ -289,7 +289,7 @@ def test_lz4_and_no_compression_and_no_chunks_are_read_too(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-def test_a_chunk_of_several_frames_is_read(compression: str, tmp_path: Path) -> None:
+def test_chunk_of_several_compression_frames_is_read(compression: str, tmp_path: Path) -> None:
     """Both formats allow it. A writer that compresses in parallel makes such chunks."""
     schema = b""
     messages = b"".join(record(5, struct.pack("<HIQQ", 1, number, number, number) + b"x" * 50) for number in range(9))
@@ -337,7 +337,7 @@ def test_bytes_after_mcap_end_are_reported(original: Original, tmp_path: Path, c
     assert shown == original.until(end)
 
 
-def test_a_damaged_index_hides_no_chunk(original: Original, tmp_path: Path) -> None:
+def test_damaged_index_hides_no_chunk(original: Original, tmp_path: Path) -> None:
     footer = len(original.data) - 37
     for at in [*range(original.chunks[-1][1] + 600, footer, 401), *range(footer, footer + 29)]:
         shown = judge(original, flipped(original.data, at, 3), at, tmp_path / "x.mcap")
@@ -385,7 +385,7 @@ def spliced(original: Original, seed: int) -> tuple[bytes, int]:
     return data, first
 
 
-def test_a_spliced_file_makes_nothing_up(original: Original, tmp_path: Path) -> None:
+def test_spliced_file_invents_no_messages(original: Original, tmp_path: Path) -> None:
     for seed in range(200):
         data, first = spliced(original, seed)
         judge(original, data, first, tmp_path / "x.mcap")
