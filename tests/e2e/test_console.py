@@ -43,7 +43,7 @@ def drive_all(stage: ConsoleStage) -> None:
 
 
 @pytest.mark.parametrize("how", ["mouse", "escape", "space", "touch", "fetch alone"])
-def test_one_press_of_stop_stops_all_cars_and_shows_each(stage: ConsoleStage, how: str) -> None:
+def test_stop_button_stops_all_cars_and_shows_each(stage: ConsoleStage, how: str) -> None:
     page = stage.phone() if how == "touch" else stage.page()
     page.locator("[data-car=red]").wait_for()
     drive_all(stage)
@@ -110,7 +110,7 @@ def test_estop_is_latched_with_reason_until_released(stage: ConsoleStage) -> Non
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_a_pad_drives_while_it_is_held(stage: ConsoleStage, size: str) -> None:
+def test_pad_drives_while_held(stage: ConsoleStage, size: str) -> None:
     options = stage.playwright.devices["Pixel 7"] if size == "phone" else {}
     page = stage.driving_page("red", **options)
     with stage.held(page, "forward"):
@@ -122,7 +122,7 @@ def test_a_pad_drives_while_it_is_held(stage: ConsoleStage, size: str) -> None:
     report.locator("[data-stop=red].stop-shown").wait_for()
 
 
-def test_a_finger_drives_until_it_is_lifted_or_leaves(stage: ConsoleStage) -> None:
+def test_touch_drives_until_finger_is_lifted_or_cancelled(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", **stage.playwright.devices["Pixel 7"])
     box = page.locator("[data-motion=spin_left]").bounding_box()
     assert box is not None
@@ -183,7 +183,7 @@ def test_page_without_focus_releases_press(stage: ConsoleStage) -> None:
         stage.stands()
 
 
-def test_a_browser_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
+def test_killed_browser_stops_car(stage: ConsoleStage) -> None:
     before = pids()
     browser = stage.launch()
     process = browser_process(before)
@@ -230,7 +230,7 @@ def test_cut_websocket_stops_car_and_late_burst_starts_nothing(stage: ConsoleSta
         assert stage.judges["red"].on_after(cut_ns) == []
 
 
-def test_a_console_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
+def test_killed_console_stops_car(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with stage.held(page, "forward"):
         killed_ns = stage.console.process.kill()
@@ -245,7 +245,7 @@ def test_a_console_that_is_killed_stops_the_car(stage: ConsoleStage) -> None:
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage, size: str) -> None:
+def test_controls_of_page_reach_car(stage: ConsoleStage, size: str) -> None:
     phone = size == "phone"
     page = stage.driving_page("red", **(stage.playwright.devices["Pixel 7"] if phone else {}))
 
@@ -291,7 +291,7 @@ def test_each_control_does_what_it_says_to_the_car(stage: ConsoleStage, size: st
     reaches(left, "[data-control=servo_horizontal] button >> nth=0", "green")
 
 
-def test_a_stick_drives_until_it_is_let_go(stage: ConsoleStage) -> None:
+def test_gamepad_stick_drives_until_released(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     page.evaluate("window.stick = [0, 0]; navigator.getGamepads = () => [null, { axes: window.stick }]")
 
@@ -350,7 +350,7 @@ def unreachable(page: Page) -> list[str]:
     return found
 
 
-def test_a_stop_is_repeated_until_the_console_is_back(stage: ConsoleStage) -> None:
+def test_stop_is_repeated_until_console_is_back(stage: ConsoleStage) -> None:
     page = stage.page()
     page.locator("[data-car=red]").wait_for()
     stage.console.process.kill()
@@ -499,7 +499,7 @@ def test_stop_button_is_visible_and_uncovered_on_phone(stage: ConsoleStage) -> N
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
 
 
-def test_the_page_breaks_no_rule_of_its_own_policy(stage: ConsoleStage) -> None:
+def test_page_violates_no_content_security_policy(stage: ConsoleStage) -> None:
     page = stage.page()
     said: list[str] = []
     page.on("console", lambda message: said.append(message.text))
@@ -581,7 +581,7 @@ def test_bad_messages_and_reconnects_move_no_car(stage: ConsoleStage) -> None:
     assert stage.judges["blue"].on_after(begun_ns) == []
 
 
-def test_a_thousand_reconnects_leave_nothing_behind(stage: ConsoleStage) -> None:
+def test_reconnects_leak_no_files_threads_or_memory(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     process = psutil.Process(stage.console.process.pid)
 
@@ -603,7 +603,7 @@ def test_a_thousand_reconnects_leave_nothing_behind(stage: ConsoleStage) -> None
     stage.stands()
 
 
-def test_a_page_that_reads_nothing_holds_up_no_other(stage: ConsoleStage) -> None:
+def test_page_that_reads_nothing_delays_no_other(stage: ConsoleStage) -> None:
     page = stage.driving_page("red")
     with socket_of(stage) as deaf:
         deaf.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -622,7 +622,7 @@ def test_two_pages_never_drive_one_car(stage: ConsoleStage) -> None:
         assert stage.judges["red"].driving
 
 
-def test_a_plan_is_shown_explained_stopped_checked_and_set(stage: ConsoleStage, tmp_path: Path) -> None:
+def test_plan_page_shows_explains_stops_checks_and_sets_plan(stage: ConsoleStage, tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     plan.write_text("roles:\n  guide: {mode: tracking}\n")
     coordinator = stage.fleet.start("-m", "fleet.cli", "plan", "run", str(plan))

@@ -126,7 +126,7 @@ OF_A_RASPBERRY_PI: list[tuple[bytes, dict[str, dict[str, Any]]]] = [
     ],
     ids=["arduino", "raspberry_pi"],
 )
-def test_a_tcp_server_that_knows_nothing_of_us(
+def test_gateway_writes_and_publishes_over_plain_tcp_server(
     fleet: FleetProcesses,
     tcp_car: TcpCar,
     platform: str,
@@ -300,7 +300,7 @@ def test_bad_commands_are_answered_and_nothing_dies(fleet: FleetProcesses, tcp_c
     assert "Traceback" not in gateway.stderr
 
 
-def test_a_second_gateway_refuses_and_names_the_first(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
+def test_second_gateway_refuses_and_names_first(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     tcp_car.obey(PI_REPORT)
     first = fleet.gateway(tcp_car.link, platform="raspberry_pi")
     fleet.ready()
@@ -429,7 +429,7 @@ def four(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Four]:
     [(signal.SIGINT, "red"), (signal.SIGTERM, "green"), (signal.SIGTERM, "blue"), (signal.SIGHUP, "white")],
     ids=["SIGINT-arduino", "SIGTERM-arduino", "SIGTERM-raspberry_pi", "SIGHUP-arduino"],
 )
-def test_a_signal_stops_the_car_first(four: Four, number: int, car: str) -> None:
+def test_signal_stops_car_before_gateway_ends(four: Four, number: int, car: str) -> None:
     fleet, sim, gateway, judge = four.fleet, four.sim, four.gateways[car], four.judges[car]
     fleet.ready(car)
     assert fleet.ask("drive", car, motion="forward", duration_s=10)["status"] in TAKEN
@@ -459,7 +459,7 @@ def test_driver_is_told_at_once_of_killed_gateway(fleet: FleetProcesses) -> None
     assert driving(sim)
 
 
-def test_a_joystick_that_dies_stops_the_car(fleet: FleetProcesses) -> None:
+def test_killed_joystick_stops_car(fleet: FleetProcesses) -> None:
     """Kill a sender with a token that streams drives. The car stops long before the end of the last drive."""
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
     fleet.gateway(link, platform="raspberry_pi")
@@ -512,7 +512,7 @@ def test_killed_gateway_leaves_car_driving_until_successor_stops_it(fleet: Fleet
     assert not fleet.state("safety").HasField("hold"), "its end survives too"
 
 
-def test_a_link_that_drops_comes_back_by_itself(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_dropped_link_reconnects(fleet: FleetProcesses, tmp_path: Path) -> None:
     sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'tty'}")
     gateway = fleet.gateway(link)
     fleet.ready()
@@ -614,7 +614,7 @@ def test_bad_input_is_one_line(only_a_hub: FleetProcesses, arguments: list[str],
     assert has_parts(line, words)
 
 
-def test_a_port_in_use_is_said(fleet: FleetProcesses) -> None:
+def test_gateway_names_process_that_uses_port(fleet: FleetProcesses) -> None:
     _, (link,) = fleet.simulate("red:arduino:pty")
     with serial.Serial(link.removeprefix("serial://"), exclusive=True):
         process = fleet.gateway(link)
@@ -630,7 +630,7 @@ def test_gateway_names_listener_that_is_no_zenoh_router(tmp_path: Path, fleet: F
     assert "Zenoh router" in line
 
 
-def test_a_link_that_is_not_there_yet_is_waited_for(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_retry_waits_for_missing_link(fleet: FleetProcesses, tmp_path: Path) -> None:
     gateway = fleet.gateway(str(tmp_path / "tty"), "--retry", platform="raspberry_pi")
     wait_for(lambda: (link := fleet.state("link")) and "no such port" in link.reason, "it says what is missing")
     fleet.simulate(f"red:raspberry_pi:pty:{tmp_path / 'tty'}")
@@ -638,7 +638,7 @@ def test_a_link_that_is_not_there_yet_is_waited_for(fleet: FleetProcesses, tmp_p
     assert gateway.end() == 0
 
 
-def test_a_signal_while_nothing_is_connected_ends_at_once(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_signal_without_link_ends_gateway_at_once(fleet: FleetProcesses, tmp_path: Path) -> None:
     gateway = fleet.gateway(str(tmp_path / "tty"), "--retry")
     wait_for(lambda: fleet.state("link"), "it runs")
     assert gateway.end(signal.SIGINT) == 1, gateway.stderr
@@ -661,7 +661,7 @@ def test_gateway_run_imports_no_unneeded_packages(fleet: FleetProcesses, tcp_car
     assert not loaded & {"click", "pydantic", "rich", "mcap", "rerun", "yaml", "fleet", "serial", "numpy", "pyarrow"}
 
 
-def test_a_gateway_ends_with_its_starter(fleet: FleetProcesses) -> None:
+def test_gateway_ends_with_its_parent(fleet: FleetProcesses) -> None:
     """If the supervisor is killed, its gateways stop their cars and end."""
     sim, (link,) = fleet.simulate("red:arduino:pty")
     arguments = ["-m", "gateway.cli", "run", "--car", "red", "--link", link, "--platform", "arduino"]

@@ -33,9 +33,7 @@ def test_any_bytes_are_given_back(tmp_path: Path, pieces: list[CapturedBytes]) -
 
 
 @given(PIECES, st.data())
-def test_a_capture_that_was_cut_anywhere_gives_its_whole_pieces(
-    tmp_path: Path, pieces: list[CapturedBytes], data: st.DataObject
-) -> None:
+def test_truncated_capture_gives_whole_pieces(tmp_path: Path, pieces: list[CapturedBytes], data: st.DataObject) -> None:
     path = tmp_path / "kept"
     whole = _kept(path, pieces)
     cut = whole[: data.draw(st.integers(0, len(whole)))]
@@ -51,7 +49,7 @@ def test_a_capture_that_was_cut_anywhere_gives_its_whole_pieces(
 
 
 @given(PIECES, st.integers(0, 10**6), st.binary(min_size=1, max_size=20))
-def test_a_damaged_capture_is_refused_or_still_pieces(
+def test_damaged_capture_is_refused_or_gives_pieces(
     tmp_path: Path, pieces: list[CapturedBytes], place: int, damage: bytes
 ) -> None:
     path = tmp_path / "kept"
@@ -100,7 +98,7 @@ HEAD = json.dumps({"format": FORMAT}) + "\n"
         '{"t": 1, "rx": "\\ud800"}',
     ],
 )
-def test_a_bad_line_is_named(tmp_path: Path, line: str) -> None:
+def test_bad_capture_line_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "kept"
     path.write_text(HEAD + '{"t": 0, "rx": "a"}\n' + line + "\n")
     pieces = read(path)
@@ -124,7 +122,7 @@ def test_capture_refuses_non_regular_file(path: Path, kind: str) -> None:
         list(read(path))
 
 
-def test_a_line_without_end_is_not_read_to_its_end(tmp_path: Path) -> None:
+def test_overlong_capture_line_is_not_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "kept"
     with path.open("w") as file:
         file.write(HEAD)
@@ -145,7 +143,7 @@ def test_capture_is_not_overwritten_and_appears_at_once(tmp_path: Path) -> None:
     writer.close()
 
 
-def test_a_capture_can_come_through_a_pipe(tmp_path: Path) -> None:
+def test_capture_is_read_from_pipe(tmp_path: Path) -> None:
     content = _kept(tmp_path / "kept", [CapturedBytes(0.5, b"abc")])
     end, other = os.pipe()
     os.write(other, content)

@@ -84,16 +84,16 @@ ODD: dict[str, CarEvidence] = {
 }
 
 
-def test_a_car_that_is_well_has_no_finding() -> None:
+def test_healthy_car_has_no_finding() -> None:
     assert diagnose(evidence(process=process(), coordinated=True)) == []
 
 
-def test_each_check_is_tried() -> None:
+def test_checks_are_all_tested() -> None:
     assert set(ODD) == {check.code for check in CHECKS}
 
 
 @pytest.mark.parametrize("code", ODD)
-def test_each_condition_has_its_cause_and_what_to_type(code: str) -> None:
+def test_finding_has_code_cause_and_todo(code: str) -> None:
     found = diagnose(ODD[code])
     assert [each.code for each in found] == [code]
     assert found[0].of_fleet is (code in ("not_recorded", "recorder_drops"))
@@ -112,7 +112,7 @@ def test_each_condition_has_its_cause_and_what_to_type(code: str) -> None:
         ("tracking", [(1.0, pb.CommandEvent(verb="drive", phase="superseded"))], ["refused"]),
     ],
 )
-def test_a_refusal_whose_cause_is_gone_is_no_finding(mode: str, later: list[Any], codes: list[str]) -> None:
+def test_past_refusal_without_cause_is_no_finding(mode: str, later: list[Any], codes: list[str]) -> None:
     now = with_states(mode=pb.Mode(asked=mode, inferred=mode, verdict="assumed"))
     assert [each.code for each in diagnose(replace(now, commands=[refused("wrong_mode"), *later]))] == codes
 
@@ -133,7 +133,7 @@ def test_bytes_without_frame_are_neither_silence_nor_bad_wire() -> None:
     assert diagnose(with_states(link=read)) == [], "it was set right: readings come"
 
 
-def test_each_rejected_frame_counts_once() -> None:
+def test_rejected_frame_counts_once() -> None:
     """The frames that came include the rejected ones. Other counts of a link are no frames."""
     (found,) = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects={"truncated": 10})))
     assert found.cause.startswith("10 of 40 frames ")
@@ -178,7 +178,7 @@ def test_last_claims_of_gone_gateway_are_told_as_past() -> None:
     assert [each.code for each in diagnose(gone)] == ["no_gateway"]
 
 
-def test_a_command_that_somebody_replaced_is_no_refusal() -> None:
+def test_superseded_command_is_no_finding() -> None:
     assert diagnose(evidence(commands=[refused("superseded", phase="failed")])) == []
 
 
@@ -189,7 +189,7 @@ def test_all_that_is_known_fits_ten_lines(code: str) -> None:
     assert as_dict(ODD[code])["facts"] == facts
 
 
-def test_the_facts_name_counts_evidence_and_the_last_refusal() -> None:
+def test_facts_have_counts_evidence_and_last_refusal() -> None:
     last = refused("held", words="red is on hold.")
     facts = dict(describe(replace(ODD["damaged_frames"], commands=[refused("leased", age_s=60), last])))
     assert "90 frames in" in facts["link"]

@@ -23,7 +23,7 @@ from schemas.duration import format_duration, parse_duration
     ("text", "seconds"),
     [("500ms", 0.5), ("2s", 2.0), ("1m30s", 90.0), ("1h", 3600.0), ("1h2m3s4ms", 3723.004), ("2", 2.0), (".5", 0.5)],
 )
-def test_a_duration_is_a_number_with_units_or_seconds(text: str, seconds: float) -> None:
+def test_parse_duration_accepts_units_or_seconds(text: str, seconds: float) -> None:
     assert parse_duration(text) == pytest.approx(seconds)
     assert Duration(7200.0).convert(text, None, None) == pytest.approx(seconds)
 
@@ -37,12 +37,12 @@ def test_anything_else_is_not(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "likely"), [("2sec", "2s"), ("1.5 Minutes", "1.5m"), ("1hour", "1h"), ("200 msec", "200ms"), ("1 s", "1s")]
 )
-def test_a_duration_in_other_words_names_the_likely_one(text: str, likely: str) -> None:
+def test_wrong_duration_unit_has_suggestion(text: str, likely: str) -> None:
     with pytest.raises(ValueError, match=f"write {likely}$"):
         parse_duration(text)
 
 
-def test_a_duration_outside_its_range_names_the_range() -> None:
+def test_duration_out_of_range_names_range() -> None:
     with pytest.raises(click.BadParameter, match=r"2h .* 1h\."):
         Duration(3600.0).convert("2h", None, None)
     with pytest.raises(click.BadParameter, match=r"0\.1 .* 500ms\."):
@@ -50,7 +50,7 @@ def test_a_duration_outside_its_range_names_the_range() -> None:
     assert [format_duration(each) for each in (0.5, 1.5, 90, 120, 86_400)] == ["500ms", "1.5s", "90s", "2m", "24h"]
 
 
-def test_a_number_outside_its_range_names_the_range() -> None:
+def test_number_out_of_range_names_range() -> None:
     assert Number(int, 1).convert("3", None, None) == 3
     with pytest.raises(click.BadParameter, match=r"0 .* 1\."):
         Number(int, 1).convert("0", None, None)
@@ -58,7 +58,7 @@ def test_a_number_outside_its_range_names_the_range() -> None:
         Number(float, 0.01, 1000.0).convert("nan", None, None)
 
 
-def test_a_color_is_a_name_or_three_bytes() -> None:
+def test_color_is_name_or_hex() -> None:
     assert Color().convert("cyan", None, None) == (0, 255, 255)
     assert Color().convert("#ff8000", None, None) == (255, 128, 0)
 
@@ -90,7 +90,7 @@ def place(tmp_path: Path) -> Path:
     return tmp_path / "sessions"
 
 
-def test_the_newest_session_is_the_one_that_was_begun_last(place: Path) -> None:
+def test_newest_session_is_last_begun(place: Path) -> None:
     names = ["20260301T000000Z-lab", "20260201T000000Z-fleet", "20260101T000000Z-fleet", "cut"]
     assert [each.name for each in newest_first(place)] == names
 
@@ -108,7 +108,7 @@ def test_the_newest_session_is_the_one_that_was_begun_last(place: Path) -> None:
         ("--sessions elsewhere", "No recordings here yet (in elsewhere)."),
     ],
 )
-def test_a_session_is_the_newest_or_named(
+def test_session_argument_is_newest_or_named(
     place: Path, arguments: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     @click.command()

@@ -109,7 +109,7 @@ def test_join_on_the_hubs_own_computer_spends_no_code(
         assert join("127.0.0.1", opened.code, opened.port).identity == person("mia")
 
 
-def test_the_right_code_joins_once(invitation: Invitation, store: HubStore) -> None:
+def test_join_code_works_once(invitation: Invitation, store: HubStore) -> None:
     joined = join("127.0.0.1", invitation.code, invitation.port)
     assert (joined.identity, joined.port, joined.fleet_file) == (person("mia"), 7447, "cars: {}")
     assert joined.ca == (store.directory / "ca.pem").read_bytes()
@@ -145,16 +145,16 @@ def test_five_wrong_codes_end_it(invitation: Invitation) -> None:
 
 
 @pytest.mark.parametrize("guess", ["\\ud800", "\\u0000", "x" * 9000])
-def test_a_guess_of_any_characters_counts(guess: str, invitation: Invitation) -> None:
+def test_join_guess_of_any_characters_is_refused(guess: str, invitation: Invitation) -> None:
     assert post(invitation, f'{{"secret": "{guess}", "request": ""}}'.encode())[0] == 403
 
 
-def test_a_thousand_guesses_at_once_are_five(invitation: Invitation) -> None:
+def test_concurrent_join_guesses_are_limited(invitation: Invitation) -> None:
     answers = [invitation._take("2" * 12, b"", [], "192.0.2.1")[0] for _ in range(1000)]
     assert answers == [403] * MAX_GUESSES + [410] * (1000 - MAX_GUESSES)
 
 
-def test_a_false_hub_gets_nothing(invitation: Invitation, tmp_path: Path) -> None:
+def test_join_sends_no_secret_to_false_hub(invitation: Invitation, tmp_path: Path) -> None:
     false = Invitation(made(tmp_path / "false"), person("mia"), hub_port=7447, address="127.0.0.1", port=free_port())
     try:
         with pytest.raises(NotJoined, match="pretends"):
@@ -177,7 +177,7 @@ def test_false_hub_beside_right_authority_gets_nothing(invitation: Invitation, t
         false.close()
 
 
-def test_an_identity_that_is_none_is_refused(invitation: Invitation) -> None:
+def test_join_refuses_invalid_identity(invitation: Invitation) -> None:
     invitation._answer["identity"] = "../../escaped"
     with pytest.raises(NotJoined, match="identity"):
         join("127.0.0.1", invitation.code, invitation.port)
@@ -193,13 +193,13 @@ def test_malformed_join_request_is_refused_and_costs_no_guess(body: bytes, invit
     assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
 
 
-def test_a_request_that_is_none_uses_up_no_code(invitation: Invitation) -> None:
+def test_invalid_certificate_request_keeps_join_code(invitation: Invitation) -> None:
     body = json.dumps({"secret": invitation.code.secret, "request": "anVuaw=="}).encode()
     assert post(invitation, body)[0] == 400
     assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
 
 
-def test_a_stranger_who_says_nothing_holds_up_nobody(invitation: Invitation) -> None:
+def test_silent_strangers_do_not_delay_join(invitation: Invitation) -> None:
     silent = [socket.create_connection(("127.0.0.1", invitation.port)) for _ in range(20)]
     try:
         assert join("127.0.0.1", invitation.code, invitation.port).identity == person("mia")
@@ -208,6 +208,6 @@ def test_a_stranger_who_says_nothing_holds_up_nobody(invitation: Invitation) -> 
             each.close()
 
 
-def test_where_nobody_listens(store: HubStore) -> None:
+def test_join_without_listener_says_no_answer(store: HubStore) -> None:
     with pytest.raises(NotJoined, match="does not answer"):
         join("127.0.0.1", JoinCode.new(bytes(32)), free_port())

@@ -55,7 +55,7 @@ rules:
         (replace(HERE, motors="unknown", verdict="contradicted", mode="tracking"), "tracking", True),
     ],
 )
-def test_a_car_is_brought_to_its_mode_or_left_alone(car: CarSnapshot, mode: str | None, asks: bool) -> None:
+def test_decision_commands_mode_only_if_car_is_usable(car: CarSnapshot, mode: str | None, asks: bool) -> None:
     result = step(FIXED, FleetSnapshot({"red": car}), PolicyState(started_at=-9.0), 0.0)
     (decision, *_) = result.decisions
     assert decision.mode == mode
@@ -92,7 +92,7 @@ def test_role_moves_after_debounce_and_does_not_return() -> None:
     assert [ask[1:] for ask in run.asked] == [("green", "tracking"), ("red", "tracking")]
 
 
-def test_a_car_that_is_away_for_less_keeps_its_role() -> None:
+def test_short_link_loss_keeps_role() -> None:
     run = PolicyRun(ONE, "green", "red")
     run.at(0.0)
     for begin in (1.0, 4.0, 7.0):
@@ -105,7 +105,7 @@ def test_a_car_that_is_away_for_less_keeps_its_role() -> None:
     assert len(run.asked) == 1
 
 
-def test_a_persons_word_frees_a_role_at_once() -> None:
+def test_hold_by_person_frees_role_at_once() -> None:
     run = PolicyRun(ONE, "green", "red")
     run.at(0.0)
     run.change("green", held_by="ann")
@@ -200,7 +200,7 @@ def test_leader_sees_lamp_and_keeps_role_during_mode_change() -> None:
     assert set(run.roles.values()) == {"wait"}
 
 
-def test_the_first_of_two_rules_that_are_true_counts() -> None:
+def test_first_true_rule_wins() -> None:
     plan = parse("""
 fixed: {red: {mode: tracking}, blue: {mode: manual}}
 rules:
@@ -300,7 +300,7 @@ phases: {a: {roles: [look], timeout_s: 0.01, next: b}, b: {roles: [go], timeout_
     assert all(after - before >= 1.5 for (before, *_), (after, *_) in pairwise(run.asked))
 
 
-def test_a_role_that_lacks_a_car_is_stood_in_for() -> None:
+def test_role_without_car_falls_back_to_if_none() -> None:
     plan = parse("""
 roles:
   strong: {mode: tracking, cars: [red], if_none: weak}
@@ -392,7 +392,7 @@ roles:
     assert [ask[1:] for ask in run.asked] == [("blue", "tracking"), ("green", "following"), ("red", "following")]
 
 
-def test_a_restarted_coordinator_switches_no_mode() -> None:
+def test_coordinator_restart_keeps_modes_and_roles() -> None:
     run = PolicyRun(TWO, "blue", "green", "red")
     run.change("red", mode="obstacle_avoidance")
     run.at(0.0)
@@ -411,7 +411,7 @@ def test_a_restarted_coordinator_switches_no_mode() -> None:
     assert len(run.asked) == 2
 
 
-def test_a_new_plan_keeps_the_roles_that_it_has_too() -> None:
+def test_carry_over_keeps_roles_of_new_plan() -> None:
     run = PolicyRun(TWO, "blue", "green", "red")
     run.at(0.0)
     before, asked = run.roles, len(run.asked)
@@ -564,7 +564,7 @@ def test_decisions_are_deterministic_for_random_courses(plan: Any, course: list[
 
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from(PLANS[:2]), st.lists(changes, max_size=12))
-def test_when_nothing_changes_any_more_nothing_is_decided_any_more(plan: Any, course: list[Any]) -> None:
+def test_decisions_settle_without_changes(plan: Any, course: list[Any]) -> None:
     _, run = _run(plan, course)
     for car in CARS:
         run.change(car, verdict="assumed", busy=False)
@@ -583,7 +583,7 @@ EXAMPLE = parse((EXAMPLES / "plans" / "2-line-guide.yaml").read_text(encoding="u
 LINE = dict.fromkeys(("left_outer", "left_inner", "right_inner", "right_outer"), False)
 
 
-def test_the_starting_plans_guide_stands_while_it_sees_no_line() -> None:
+def test_example_plan_guide_stands_without_line() -> None:
     run = PolicyRun(EXAMPLE, "blue", "green", "red")
     for car in run.cars:
         run.sees(car, battery={"voltage_v": 7.9, "level": "ok"})
@@ -599,7 +599,7 @@ def test_the_starting_plans_guide_stands_while_it_sees_no_line() -> None:
     assert run.of(guide).mode == "tracking"
 
 
-def test_the_starting_plan_shows_which_car_is_too_weak() -> None:
+def test_example_plan_blinks_weak_car() -> None:
     run = PolicyRun(EXAMPLE, "blue", "red")
     run.sees("blue", battery={"voltage_v": 7.9, "level": "ok"})
     asked = []

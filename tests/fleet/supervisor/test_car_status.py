@@ -27,7 +27,7 @@ from schemas.words import ProcessKind, RunState
 from tests.support.text_parts import has_parts
 
 
-def test_a_row_says_what_is_new_once() -> None:
+def test_car_status_reports_each_change_once() -> None:
     row = CarStatus("red")
     online = pb.Link(state="online", reason="readings arrive")
     assert row.take("state/link", online, 0.0).startswith("link online: ")
@@ -67,7 +67,7 @@ def test_car_is_ready_with_open_link_and_no_waiting_command(
     assert bool(row.state.why_missing(1.0)) == bool(why)
 
 
-def test_a_late_message_of_an_ended_gateway_brings_nothing_back() -> None:
+def test_late_message_of_ended_gateway_is_ignored() -> None:
     row = CarStatus("red")
     row.take("state/link", pb.Link(state="online", boot_id="a"), 0.0)
     row.take("state/safety", pb.Safety(motors="on", boot_id="a"), 0.0)
@@ -96,7 +96,7 @@ def test_a_late_message_of_an_ended_gateway_brings_nothing_back() -> None:
         ),
     ],
 )
-def test_a_start_ends_with_one_line(names: list[str], missing: dict[str, str], words: str) -> None:
+def test_describe_start_is_one_line(names: list[str], missing: dict[str, str], words: str) -> None:
     assert has_parts(describe_start(names, missing, "s"), words)
 
 
@@ -110,7 +110,7 @@ def test_start_timeout_counts_from_last_ready_car() -> None:
     assert StartProgress().has_ended(0, 0.0, unreachable=False)
 
 
-def test_a_row_shows_hold_and_e_stop() -> None:
+def test_car_status_reports_hold_and_estop() -> None:
     row = CarStatus("red")
     assert row.take("state/safety", pb.Safety(motors="off"), 0.0) == ""
     held = pb.Safety(hold=pb.Hold(by="ann@laptop-4711"))
@@ -162,7 +162,7 @@ def test_old_hold_or_estop_is_told_with_release(safety: pb.Safety, words: str) -
     assert describe_old_stops("red", safety, TODAY) == words
 
 
-def test_the_rate_is_what_came_over_some_seconds() -> None:
+def test_frame_rate_is_mean_of_seconds() -> None:
     row = CarStatus("red")
     for second in range(5):
         row.take("state/link", pb.Link(state="online", rx_frames=second * 25), float(second))
@@ -174,7 +174,7 @@ def test_the_rate_is_what_came_over_some_seconds() -> None:
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
-def test_the_table_fits_and_names_every_car(width: int) -> None:
+def test_status_table_fits_width_and_names_every_car(width: int) -> None:
     spec = FleetSpec(endpoint="tcp/127.0.0.1:7999", colors={"red": "#010203", "green": "#030201"})
     supervisor = Supervisor(spec, "", lambda: spec, lambda event: None)
     for name, kind in (("@hub", ProcessKind.HUB), ("red", ProcessKind.GATEWAY), ("green", ProcessKind.GATEWAY)):
@@ -228,7 +228,7 @@ def test_status_table_names_holder_driver_and_last_word() -> None:
     assert "(sent)" not in line(), "nobody claims it now"
 
 
-def test_a_log_keeps_its_bounds_and_the_newest_lines(tmp_path: Path) -> None:
+def test_log_file_is_bounded_and_keeps_newest_lines(tmp_path: Path) -> None:
     log = Log(tmp_path / "red.log", limit_bytes=10_000)
     for number in range(2000):
         log.add(f"line {number}", 1_700_000_000.25)
@@ -245,7 +245,7 @@ def test_unwritable_log_is_told_and_harmless(tmp_path: Path) -> None:
     assert "cannot be written: " in log.failed
 
 
-def test_the_oldest_runs_are_removed_unless_they_may_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_old_run_directories_are_removed_unless_in_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
     place = runs_directory("lab", DEFAULT_ENDPOINT)
     for number in range(MAX_RUN_DIRECTORIES + 5):

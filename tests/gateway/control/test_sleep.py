@@ -29,7 +29,7 @@ def sleep(desk: Workbench, slept_s: float = NIGHT_S, *, counted: bool = False) -
 
 @pytest.mark.parametrize("counted", [False, True])
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi", "stm32"])
-def test_a_drive_is_over_and_the_car_is_stopped_first(platform: str, *, counted: bool) -> None:
+def test_sleep_ends_drive_and_stops_car_first(platform: str, *, counted: bool) -> None:
     desk = Workbench(platform).ready()
     desk.ask(FORWARD, PERSON, identity="drive")
     desk.run(1.0)
@@ -55,7 +55,7 @@ def test_queued_commands_expire_after_sleep(desk: Workbench, *, counted: bool) -
     assert {desk.end(each) for each in ("led", "fan", "mode")} == {(Phase.EXPIRED, Reason.EXPIRED)}
 
 
-def test_a_mode_that_runs_is_stopped(desk: Workbench) -> None:
+def test_sleep_stops_running_mode(desk: Workbench) -> None:
     desk.ask(SetMode(Mode.TRACKING))
     desk.run(4.0)
     sleep(desk)
@@ -75,7 +75,7 @@ def test_car_shown_standing_gets_no_frame_after_sleep(desk: Workbench) -> None:
 
 
 @pytest.mark.parametrize("counted", [False, True])
-def test_the_silence_during_the_sleep_is_none_of_the_car(desk: Workbench, *, counted: bool) -> None:
+def test_sleep_is_no_silence_of_car(desk: Workbench, *, counted: bool) -> None:
     desk.ask(Stop())
     desk.run(8.0)
     sleep(desk, counted=counted)
@@ -98,7 +98,7 @@ def test_report_times_from_before_the_sleep_show_nothing(desk: Workbench) -> Non
     assert desk.control.driver.model.basis is not Basis.SHOWN, "one report after the sleep shows no pause"
 
 
-def test_a_stop_from_before_the_sleep_goes_on(desk: Workbench) -> None:
+def test_stop_continues_after_sleep(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop(), identity="stop", pump=False)
@@ -108,7 +108,7 @@ def test_a_stop_from_before_the_sleep_goes_on(desk: Workbench) -> None:
 
 
 @pytest.mark.parametrize("counted", [False, True])
-def test_a_joystick_that_is_still_pushed_must_pause(desk: Workbench, *, counted: bool) -> None:
+def test_stream_must_pause_after_sleep(desk: Workbench, *, counted: bool) -> None:
     for _ in range(5):
         desk.ask(Drive(Motion.FORWARD, 0.5), PERSON, streamed=True, age_s=0.0)
         desk.run(0.05)
@@ -135,7 +135,7 @@ def test_command_after_sleep_needs_a_timestamp(desk: Workbench) -> None:
 
 @pytest.mark.parametrize("counted", [False, True])
 @pytest.mark.parametrize(("slept_s", "left"), [(590.0, True), (610.0, False)])
-def test_a_loan_counts_the_sleep(desk: Workbench, slept_s: float, *, left: bool, counted: bool) -> None:
+def test_loan_time_includes_sleep(desk: Workbench, slept_s: float, *, left: bool, counted: bool) -> None:
     desk.ask(Lend("ann", 600.0), PERSON)
     sleep(desk, slept_s, counted=counted)
     assert (desk.control.safety.loan_at(desk.now) is not None) is left

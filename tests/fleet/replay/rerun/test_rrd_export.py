@@ -31,12 +31,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Counter[str]]:
     return path, make(path)
 
 
-def test_the_made_session_has_every_message_type(made: tuple[Path, Counter[str]]) -> None:
+def test_made_session_has_every_message_type(made: tuple[Path, Counter[str]]) -> None:
     topics = {key.split("/", 2)[2] if "@" not in key else key.split("/", 1)[1] for key in made[1]}
     assert topics == set(TOPICS)
 
 
-def test_the_rrd_holds_every_message_and_its_layout(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+def test_rrd_has_every_message_and_layout(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     path, counts = made
     out = tmp_path / "out.rrd"
     assert rrd_export.export(Session(path), out).shown == counts
@@ -82,7 +82,7 @@ def test_rrd_texts_and_lanes_match_messages(made: tuple[Path, Counter[str]], tmp
 
 
 @pytest.mark.parametrize("topic", ["sim/truth", "sensor/pose"])
-def test_a_place_is_an_arrow_with_a_path(topic: str, made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+def test_pose_is_drawn_as_arrow_with_path(topic: str, made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     out = tmp_path / "out.rrd"
     rrd_export.export(Session(made[0]), out)
     key = f"fleet/red/{topic}"
@@ -122,7 +122,7 @@ def test_lanes_say_what_was_so_and_for_how_long(made: tuple[Path, Counter[str]],
     assert None not in [state for _, state in lanes["fleet/red/state/mode", "mode inferred"]]
 
 
-def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
+def test_panel_parts_are_fields_of_their_messages() -> None:
     from schemas.messages import message_class
 
     for part in panels.parts():
@@ -137,7 +137,7 @@ def test_every_lane_and_curve_is_a_field_of_its_message() -> None:
         assert {*words.fields, *words.before} <= set(fields)
 
 
-def test_every_topic_of_the_table_is_drawn() -> None:
+def test_topics_are_all_drawn() -> None:
     drawn = {part.topic for part in panels.parts()} | {words.topic for words in panels.TEXT_LINES}
     drawn |= {topic for panel in panels.CAR_PANELS for topic in panel.topics}
     drawn |= {topic for _, ours, theirs in panels.FLEET_TEXTS for topic in (*ours, *theirs)}
@@ -154,7 +154,7 @@ def test_rerun_names_entities_as_we_do(made: tuple[Path, Counter[str]]) -> None:
     assert found == {panels.entity(key) for key in made[1]}
 
 
-def test_a_cut_session_replays_what_is_whole_and_says_so(tmp_path: Path) -> None:
+def test_truncated_session_replays_whole_part(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     class Flushing(Writer):
@@ -208,7 +208,9 @@ def test_without_a_display_a_file_is_proposed(made: tuple[Path, Counter[str]], m
 
 
 @pytest.mark.parametrize("size", [8, 9, 20, 30, 200, 1000])
-def test_a_recording_that_was_cut_at_once_is_said(made: tuple[Path, Counter[str]], tmp_path: Path, size: int) -> None:
+def test_recording_without_intact_message_is_refused(
+    made: tuple[Path, Counter[str]], tmp_path: Path, size: int
+) -> None:
     cut = tmp_path / "0001.mcap"
     cut.write_bytes(made[0].read_bytes()[:size])
     result = CliRunner().invoke(replay, [str(cut), "--save", str(tmp_path / "out.rrd")])
@@ -236,7 +238,7 @@ def test_export_tells_damage_and_shows_whole_part(made: tuple[Path, Counter[str]
         assert all(count <= made[1][key] for key, count in shown.items())
 
 
-def test_a_recording_or_a_device_is_not_overwritten(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+def test_export_overwrites_no_recording_or_device(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     before = made[0].read_bytes()
     link = tmp_path / "link.rrd"
     link.symlink_to(made[0])
@@ -249,7 +251,7 @@ def test_a_recording_or_a_device_is_not_overwritten(made: tuple[Path, Counter[st
 
 
 @pytest.mark.parametrize("damaged", [False, True])
-def test_a_full_disk_is_said_in_our_words_only(
+def test_export_on_full_disk_fails_in_our_words(
     made: tuple[Path, Counter[str]], tmp_path: Path, *, damaged: bool
 ) -> None:
     source, out = tmp_path / "x.mcap", tmp_path / "out.rrd"
@@ -286,7 +288,7 @@ def test_ctrl_c_does_not_blame_the_recording(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
+def test_export_of_empty_session_is_refused(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
     with (tmp_path / "0001.mcap").open("wb") as file:
@@ -297,7 +299,7 @@ def test_a_session_without_messages_is_said(tmp_path: Path) -> None:
         rrd_export.export(Session(tmp_path), tmp_path / "out.rrd")
 
 
-def test_nothing_is_written_outside(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
+def test_export_writes_nothing_outside_target(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
     home, work = tmp_path / "home", tmp_path / "work"
     home.mkdir()
     work.mkdir()

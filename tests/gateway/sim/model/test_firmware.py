@@ -71,7 +71,7 @@ def test_opening_times_are_those_of_the_table() -> None:
 
 
 @pytest.mark.parametrize(("echo", "least", "most"), [(True, 0.004, 0.040), (False, 1.0, 1.0)])
-async def test_the_report_itself_blocks(echo: bool, least: float, most: float) -> None:
+async def test_report_blocks_car(echo: bool, least: float, most: float) -> None:
     blocks = []
     for sent_at in range(60):
         # The car obeys a frame at once, or after the report that it met.
@@ -93,7 +93,7 @@ async def test_motion_comes_after_whatever_else_in_the_frame_blocks() -> None:
     assert car.car.motor_log[-1][0] == pytest.approx(19 / 960 + 0.30 + 0.65 + 0.65)
 
 
-async def test_a_raspberry_pi_fan_blocks_for_a_second() -> None:
+async def test_raspberry_pi_fan_blocks_for_one_second() -> None:
     for tcp in (False, True):
         car = virtual("raspberry_pi", tcp=tcp)
         await car.write(FAN)
@@ -129,7 +129,7 @@ async def test_filler_and_rate_of_the_modes_that_talk(mode: int, frame: bytes, r
 
 
 @pytest.mark.parametrize("mode", [1, 3, 4])
-async def test_the_silent_modes(mode: int) -> None:
+async def test_arduino_silent_modes_send_no_report(mode: int) -> None:
     car = virtual()
     await car.write(opening(mode))
     assert await frames(car, 10) == b""
@@ -165,13 +165,13 @@ async def test_without_echo(platform: str, word: bytes) -> None:
     assert data.count(word) == data.count(b"CSB") == pytest.approx(10, abs=1)
 
 
-async def test_a_raspberry_pi_behind_a_serial_link_greets() -> None:
+async def test_raspberry_pi_greets_over_serial_link() -> None:
     car = virtual("raspberry_pi")
     await car.wait(0.1)
     assert car.received == b"serial is on!"
 
 
-async def test_the_car_sends_no_faster_than_its_uart() -> None:
+async def test_car_sends_no_faster_than_uart() -> None:
     car = virtual()
     await car.write(opening(2))
     await car.wait(5)
@@ -192,7 +192,7 @@ async def test_more_than_64_bytes_while_blocked_are_lost() -> None:
     await car.until(lambda truth: truth.driving)
 
 
-async def test_a_wedged_car_does_not_grow() -> None:
+async def test_wedged_arduino_string_is_bounded() -> None:
     car = virtual()
     await car.write(b"$4WD,nonsense#")
     await car.wait(0.1)
@@ -260,7 +260,7 @@ SAYS: list[tuple[bytes, Callable[[Truth], object], object]] = [
 
 @pytest.mark.parametrize(("frame", "what", "value"), SAYS)
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
-async def test_the_rest_of_what_a_frame_does(
+async def test_frame_sets_truth_of_car(
     platform: str, frame: bytes, what: Callable[[Truth], object], value: object
 ) -> None:
     car = virtual(platform)
@@ -279,7 +279,7 @@ async def test_all_lights_of_an_arduino() -> None:
     assert seen == ["#ffffff", "#ff0000", "#00ff00", "#0000ff", "#00ffff", "#ff00ff", "#ffff00", "off"]
 
 
-async def test_the_fan_toggles_and_0_leaves_it() -> None:
+async def test_fan_frame_toggles_and_zero_leaves_it() -> None:
     car = virtual()
     for frame, on in ((FAN, True), (STOP, True), (FAN, False), (STOP, False)):
         await car.write(frame)
@@ -287,7 +287,7 @@ async def test_the_fan_toggles_and_0_leaves_it() -> None:
         assert car.truth.fan is on
 
 
-async def test_a_colour_frame_leaves_the_motors_alone() -> None:
+async def test_color_frame_leaves_motors_alone() -> None:
     car = virtual()
     await car.write(RUN)
     await car.wait(0.1)
@@ -396,7 +396,7 @@ async def test_brown_out_boots_to_mode_0_with_motors_off() -> None:
     await car.until(lambda truth: truth.driving)
 
 
-async def test_a_brown_out_cuts_the_frame_that_is_being_sent() -> None:
+async def test_brown_out_truncates_frame_in_transit() -> None:
     car = virtual()
     await car.until_received(20)
     car.car.brown_out(car.now)
@@ -416,7 +416,7 @@ async def test_dropped_link_loses_bytes_and_leaves_half_frame() -> None:
     assert car.truth.driving  # row "half a general frame, then a stop"
 
 
-async def test_a_raspberry_pi_camera_turns_until_told_otherwise() -> None:
+async def test_raspberry_pi_camera_turns_until_stopped() -> None:
     car = virtual("raspberry_pi", tcp=True)
     assert isinstance(car.car, RaspberryPiCar)
     await car.write(general(servo=6))

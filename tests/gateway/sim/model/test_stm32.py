@@ -14,7 +14,7 @@ def stm32() -> VirtualStranger:
 
 
 @pytest.mark.parametrize("frame", [MODE00, WHISTLE, PTZ90, FAN, b"$4WD,CLR1,CLG2,CLB3#", opening(3) + MODE00])
-async def test_no_frame_delays_a_report(frame: bytes) -> None:
+async def test_stm32_frames_delay_no_report(frame: bytes) -> None:
     car = stm32()
     times = await report_times(car, 2.5)
     for _ in range(3):
@@ -39,7 +39,7 @@ async def test_mode_frame_turns_motors_and_led_off_without_block(frame: bytes) -
 
 
 @pytest.mark.parametrize("mode", [2, 5, 6])
-async def test_the_modes_that_print_elsewhere_are_silent(mode: int) -> None:
+async def test_stm32_modes_send_no_reports(mode: int) -> None:
     car = stm32()
     await car.write(opening(mode))
     await car.wait(0.1)
@@ -58,7 +58,7 @@ async def test_tracking_drives() -> None:
 
 
 @pytest.mark.parametrize("mode", range(1, 7))
-async def test_a_general_frame_is_obeyed_in_every_mode_at_once(mode: int) -> None:
+async def test_stm32_general_frame_is_obeyed_in_every_mode(mode: int) -> None:
     car = stm32()
     await car.write(opening(mode))
     await car.wait(1.2)
@@ -90,7 +90,7 @@ async def test_last_of_two_frames_counts_during_report() -> None:
         assert car.truth.driving is driving
 
 
-async def test_a_lone_hash_does_nothing() -> None:
+async def test_stm32_lone_hash_does_nothing() -> None:
     car = stm32()
     await car.write(RUN)
     await car.until(lambda truth: truth.driving)
@@ -100,7 +100,7 @@ async def test_a_lone_hash_does_nothing() -> None:
     assert car.truth.driving
 
 
-async def test_a_half_frame_is_restarted_by_the_next() -> None:
+async def test_stm32_half_frame_is_restarted_by_next() -> None:
     car = stm32()
     await car.write(b"$1,0,0,0,0")
     await car.wait(0.2)
@@ -130,7 +130,7 @@ async def test_half_mode_frame_over_stop_starts_standing_car() -> None:
     assert 3 <= sum(tries) <= 5, "a window of two bytes, 2.1 ms"
 
 
-async def test_nothing_starts_it_if_a_report_fits_between_two_frames() -> None:
+async def test_stm32_stop_and_mode00_with_gap_start_no_motor() -> None:
     for offset in range(0, 1000, 7):
         car = stm32()
         await report_times(car, 1.5)
@@ -167,7 +167,7 @@ async def test_speed_is_200_of_1000_in_steps_of_100() -> None:
 
 
 @pytest.mark.parametrize("mode", [3, 4])
-async def test_a_mode_that_waits_obeys_a_close_at_once(mode: int) -> None:
+async def test_stm32_waiting_mode_obeys_close_at_once(mode: int) -> None:
     car = stm32()
     await car.write(opening(mode))
     await car.wait(3.1)
@@ -177,7 +177,7 @@ async def test_a_mode_that_waits_obeys_a_close_at_once(mode: int) -> None:
     assert not car.truth.driving
 
 
-async def test_a_brown_out_boots_and_the_timer_starts_again() -> None:
+async def test_stm32_brown_out_stops_motors_and_restarts_timer() -> None:
     car = stm32()
     await car.write(RUN)
     await car.wait(2.0)
@@ -194,11 +194,11 @@ async def test_stm32_options_print_after_report() -> None:
     assert b"#$4WD,J110,J220,J330,J440,J550,J660#$4WD,MPUgx" in car.received
 
 
-def test_the_traits_of_the_program() -> None:
+def test_stm32_traits() -> None:
     assert (STM32_TRAITS.interval_s, STM32_TRAITS.gray_max, STM32_TRAITS.timer) == (1.0, 4095, True)
 
 
-async def test_the_timer_goes_on_in_every_mode() -> None:
+async def test_stm32_timer_runs_on_in_modes() -> None:
     car = stm32()
     last = (await report_times(car, 1.5))[-1]
     await car.write(opening(2))

@@ -36,7 +36,7 @@ async def intervals(car: VirtualStranger, seconds: float) -> list[float]:
 
 
 @pytest.mark.parametrize("interval_s", [0.71, MEASURED_S, 2.2])
-async def test_the_interval_is_that_on_the_wire(interval_s: float) -> None:
+async def test_trait_interval_is_seen_on_wire(interval_s: float) -> None:
     for each in await intervals(virtual(traits=CarTraits(interval_s=interval_s)), 20):
         assert each == pytest.approx(interval_s, abs=SLACK_S)
 
@@ -48,7 +48,7 @@ async def test_without_an_echo_the_interval_is_longer_by_the_ranging() -> None:
 
 
 @pytest.mark.parametrize("timer", [False, True])
-async def test_the_spread_is_either_way_and_no_more(timer: bool) -> None:
+async def test_trait_spread_bounds_intervals(timer: bool) -> None:
     found = await intervals(virtual(traits=CarTraits(interval_s=1.0, spread_s=0.08, timer=timer)), 100)
     assert 0.9 < min(found) < 0.95
     assert 1.05 < max(found) < 1.1
@@ -77,7 +77,7 @@ async def test_blocking_frame_delays_report_unless_timer(frame: bytes, delay_s: 
     assert second - first == pytest.approx(MEASURED_S, abs=SLACK_S)
 
 
-async def test_a_timer_reports_during_a_block_too() -> None:
+async def test_timer_reports_during_block() -> None:
     car = virtual(traits=CarTraits(interval_s=0.3, timer=True))
     await report_times(car, 1.0)
     await car.write(MODE00)
@@ -86,7 +86,7 @@ async def test_a_timer_reports_during_a_block_too() -> None:
     assert car.truth.blocked
 
 
-async def test_a_timer_starts_again_after_a_brown_out() -> None:
+async def test_timer_restarts_after_brown_out() -> None:
     car = virtual(traits=CarTraits(interval_s=0.4, timer=True))
     await car.wait(1.0)
     car.car.brown_out(car.now)
@@ -95,14 +95,14 @@ async def test_a_timer_starts_again_after_a_brown_out() -> None:
 
 
 @pytest.mark.parametrize("close_s", [0.0, 0.2, 1.3])
-async def test_a_close_blocks_for_its_time(close_s: float) -> None:
+async def test_trait_close_blocks_for_its_time(close_s: float) -> None:
     car = virtual(traits=CarTraits(interval_s=1.0, close_s=close_s))
     before = (await report_times(car, 2.5))[-1]
     await car.write(MODE00)
     assert (await report_times(car, 3.0))[0] - before == pytest.approx(1.0 + close_s, abs=SLACK_S)
 
 
-async def test_the_last_frame_of_a_string_wins() -> None:
+async def test_trait_last_frame_wins() -> None:
     car = virtual(traits=CarTraits(last_frame_wins=True))
     await car.write(PTZ90)
     await car.until(lambda truth: truth.blocked)
@@ -117,7 +117,7 @@ async def test_the_last_frame_of_a_string_wins() -> None:
     await car.until(lambda truth: truth.motor_left > 0)
 
 
-async def test_the_first_frame_of_a_string_wins_without_the_trait() -> None:
+async def test_first_frame_wins_without_trait() -> None:
     car = virtual()
     await car.write(PTZ90)
     await car.until(lambda truth: truth.blocked)
@@ -126,7 +126,7 @@ async def test_the_first_frame_of_a_string_wins_without_the_trait() -> None:
     await car.until(lambda truth: truth.driving)
 
 
-async def test_a_silent_mode_prints_nothing_and_drives() -> None:
+async def test_trait_silent_mode_drives_without_reports() -> None:
     car = virtual(traits=CarTraits(silent_modes=frozenset({Mode.TRACKING})))
     await car.write(opening(2))
     await car.until(lambda truth: truth.mode == "tracking" and truth.driving)
@@ -140,7 +140,7 @@ async def test_a_silent_mode_prints_nothing_and_drives() -> None:
 
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
-async def test_a_text_line_follows_each_general_frame(platform: str) -> None:
+async def test_trait_text_follows_each_general_frame(platform: str) -> None:
     car = virtual(platform, traits=CarTraits(text=True))
     for _ in range(3):
         await car.write(STOP)
@@ -181,7 +181,7 @@ async def test_other_frame_head_in_both_directions(platform: str) -> None:
     assert b"4WD" not in car.received
 
 
-async def test_the_digits_of_a_mode_frame_are_behind_another_head() -> None:
+async def test_trait_head_is_read_in_mode_frames() -> None:
     car = virtual(traits=CarTraits(head="BALA"))
     await car.write(RUN)
     await car.wait(0.1)
@@ -192,7 +192,7 @@ async def test_the_digits_of_a_mode_frame_are_behind_another_head() -> None:
 
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
-async def test_the_fan_as_a_level(platform: str) -> None:
+async def test_trait_fan_level_follows_frame(platform: str) -> None:
     car = virtual(platform, traits=CarTraits(fan_level=True))
     for frame, on in [(FAN, True), (FAN, True), (STOP, False), (STOP, False)]:
         await car.write(frame)
@@ -202,7 +202,7 @@ async def test_the_fan_as_a_level(platform: str) -> None:
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
 @pytest.mark.parametrize(("direct", "servo"), [(False, 150), (True, 30)])
-async def test_the_servo_goes_where_the_frame_says_or_opposite(platform: str, direct: bool, servo: int) -> None:
+async def test_trait_ptz_direct_sets_servo_direction(platform: str, direct: bool, servo: int) -> None:
     car = virtual(platform, traits=CarTraits(ptz_direct=direct))
     await car.write(b"$4WD,PTZ30#")
     await car.wait(0.2)

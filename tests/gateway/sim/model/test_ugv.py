@@ -47,7 +47,7 @@ FORWARD = '{"T":1,"L":0.2,"R":0.2}\n'
 
 
 @pytest.mark.parametrize("platform", ["wave_rover", "ugv01", "ugv_rover"])
-def test_the_dead_man_stops_it_once(platform: str) -> None:
+def test_ugv_dead_man_stops_car(platform: str) -> None:
     main = UGV_BUILDS[platform].main
     host = Host(platform).send(f'{{"T":900,"main":{main},"module":0}}\n', FORWARD).run(1.0)
     assert host.car.moving
@@ -64,7 +64,7 @@ def test_motion_by_t13_is_never_stopped_on_one_firmware() -> None:
     assert not host.car.moving
 
 
-def test_a_negative_dead_man_is_none() -> None:
+def test_ugv_negative_dead_man_never_stops() -> None:
     host = Host("ugv_rover").send('{"T":136,"cmd":-1}\n', FORWARD).run(20.0)
     assert host.car.moving
 
@@ -92,11 +92,11 @@ def test_partial_line_spoils_next_and_line_end_clears_it() -> None:
     assert Host("wave_rover").send('{"T":1,"L":0.', "\n", FORWARD).run(0.3).car.moving
 
 
-def test_the_second_object_of_a_line_is_dropped() -> None:
+def test_ugv_second_object_of_line_is_dropped() -> None:
     assert not Host("wave_rover").send('{"T":130}{"T":1,"L":0.2,"R":0.2}\n').run(0.3).car.moving
 
 
-def test_one_half_is_full_power_on_an_open_loop() -> None:
+def test_ugv_half_is_full_power_on_open_loop() -> None:
     assert Host("wave_rover").send('{"T":1,"L":0.5,"R":0.5}\n').duty == (255, 255)
 
 
@@ -107,7 +107,7 @@ def test_without_encoders_the_speeds_are_nothing_or_the_command() -> None:
     assert (host.feedback()["L"], host.car.moving) == (0, True)
 
 
-def test_a_question_within_the_gap_has_no_answer() -> None:
+def test_ugv_poll_within_stream_gap_has_no_answer() -> None:
     host = Host("wave_rover").send('{"T":142,"cmd":1000}\n', '{"T":130}\n')
     host.heard = b""
     assert host.send('{"T":130}\n').run(0.3).heard.count(b"1001") == 0
@@ -132,7 +132,7 @@ def test_reset_forgets_chassis_on_one_firmware() -> None:
     assert host.car._wheels[0] < 0
 
 
-def test_a_boot_mission_drives_and_an_early_byte_aborts_it() -> None:
+def test_ugv_boot_mission_drives_and_early_byte_aborts_it() -> None:
     host = Host("ugv_rover", "mission")
     host.car.brown_out(host.now)
     assert host.run(UGV_BOOT_S + 3.0).heard.startswith(b"ets")
@@ -141,19 +141,19 @@ def test_a_boot_mission_drives_and_an_early_byte_aborts_it() -> None:
     assert not host.car.moving
 
 
-def test_a_delay_keeps_the_dead_man_from_its_check() -> None:
+def test_ugv_delay_command_suspends_dead_man() -> None:
     host = Host("ugv_rover").send(FORWARD).run(0.5).send('{"T":111,"cmd":8000}\n').run(6.0)
     assert host.car.moving
 
 
-def test_nothing_stops_and_drops_an_arm_on_one_firmware_only() -> None:
+def test_ugv_t0_stops_on_ros_firmware_only() -> None:
     for empty in ('{"T":0}\n', "{}\n", "[]\n"):
         assert not Host("ugv_rover").send(FORWARD).run(0.5).send(empty).run(0.5).car.moving
     host = Host("ugv01").send('{"T":900,"main":3,"module":0}\n', FORWARD).run(0.5).send('{"T":0}\n').run(0.5)
     assert host.car.moving
 
 
-def test_an_answer_without_a_line_end_glues_the_next_feedback() -> None:
+def test_ugv_answer_without_line_end_glues_next_feedback() -> None:
     host = Host("ugv_rover").run(0.2)
     host.heard = b""
     host.send('{"T":405}\n').run(0.3)
@@ -189,7 +189,7 @@ def test_arm_numbers_replace_other_fields(platform: str) -> None:
     assert host.send(f'{{"T":900,"main":{main},"module":0}}\n', '{"T":130}\n').feedback()[place] != of_arm
 
 
-def test_a_gimbal_that_is_not_there_slows_its_loop() -> None:
+def test_ugv_missing_gimbal_slows_feedback() -> None:
     host = Host("ugv01", "gimbal").send('{"T":131,"cmd":1}\n')
     host.heard = b""
     assert host.run(2.0).heard.count(b'{"T":1001') in (9, 10, 11)

@@ -48,7 +48,7 @@ def test_how_long_a_frame_blocks(row: dict[str, str]) -> None:
     assert parse_platform(row["platform"]).block_s(frame) == pytest.approx(float(row["seconds"]))
 
 
-def test_the_longest_block_outside_avoidance() -> None:
+def test_longest_block_outside_avoidance() -> None:
     profile = parse_platform("unknown+arm")
     frames = [parse_sent(wire(row["bytes"])) for row in PLATFORMS]
     assert max(profile.block_s(frame) for frame in frames if frame) == pytest.approx(LONGEST_BLOCK_S)
@@ -57,14 +57,14 @@ def test_the_longest_block_outside_avoidance() -> None:
 
 
 @pytest.mark.parametrize("row", TURNS, ids=ids(TURNS))
-def test_the_turn_and_rate_of_each_mode(row: dict[str, str]) -> None:
+def test_mode_turn_and_report_rate(row: dict[str, str]) -> None:
     profile, mode = parse_platform("arduino"), Mode(row["mode"])
     assert profile.mode_turn_s(mode) == float(row["seconds"])
     assert MODES[mode].rate_hz == float(row["hz"])
     assert (mode in profile.silent_modes) is (float(row["hz"]) == 0)
 
 
-def test_every_mode_has_a_row_and_a_turn() -> None:
+def test_modes_have_row_and_turn() -> None:
     assert {row["mode"] for row in TURNS} == set(MODES) == set(Mode)
     assert len({row.digit for row in MODES.values()}) == len(MODES)
 
@@ -85,7 +85,7 @@ def test_platform_measured_values(row: dict[str, str], platform: Platform) -> No
     assert profile.obstacle(event) == (obstacle if "obstacle" in profile.measured(event) else None)
 
 
-def test_a_confirmed_mode_chooses_among_candidates_and_decides_nothing_else() -> None:
+def test_confirmed_mode_chooses_among_candidates() -> None:
     profile = parse_platform("arduino")
     either = sensors(b"$4WD,CSB120,PV8.3,GS000,LF0000,HW00,GM00", "silence")
     assert profile.measured(either, Mode.FOLLOWING) == {"obstacle"}
@@ -138,7 +138,9 @@ def test_speed_is_counted_in_steps(row: dict[str, str]) -> None:
         ("unknown", 1, StopStyle.GENERAL, False, "drive whistle speed servo fan light"),
     ],
 )
-def test_a_platform_at_a_glance(platform: str, modes: int, stop: StopStyle, observed: bool, capabilities: str) -> None:
+def test_platform_profile_summary(
+    platform: str, modes: int, stop: StopStyle, observed: bool, capabilities: str
+) -> None:
     profile = parse_platform(platform)
     assert profile.name == platform
     assert len(profile.modes) == modes
@@ -167,7 +169,7 @@ def test_unknown_platform_is_refused_with_choices(text: str, words: str) -> None
         parse_platform(text)
 
 
-def test_a_platform_in_any_case_is_known() -> None:
+def test_platform_name_ignores_case() -> None:
     assert parse_platform("Arduino").name == "arduino"
 
 
@@ -198,14 +200,14 @@ def test_car_without_readings_measures_nothing_and_is_silent() -> None:
         ("unknown", "PV12.60,GS4095", "battery"),
     ],
 )
-def test_the_range_of_a_field_is_that_of_the_car(platform: str, text: str, rejected: str) -> None:
+def test_field_range_depends_on_platform(platform: str, text: str, rejected: str) -> None:
     event = sensors(f"$4WD,CSB57.24,{text},LF1011,HW01,GM10#".encode(), "#")
     profile, words = parse_platform(platform), rejected.split()
     assert profile.measured(event) == EVERY_MEASUREMENT - set(words)
     assert [reject.word for reject in profile.rejects(event)] == [{"battery": "PV"}.get(word, "GS") for word in words]
 
 
-def test_a_field_that_no_car_has_is_rejected_once() -> None:
+def test_field_out_of_every_range_is_rejected_once() -> None:
     event = sensors(b"$4WD,CSB1300,PV14,GS5000,LF1011,HW01,GM10#", "#")
     assert parse_platform("arduino").rejects(event) == event.rejects
 
@@ -216,7 +218,7 @@ def test_stm32_constants_are_no_measurements() -> None:
     assert profile.measured(sensors(b"$4WD,CSB57.24,PV7.91,GS0,LF0000,HW00,GM01#", "#")) == EVERY_MEASUREMENT
 
 
-def test_no_frame_blocks_stm32_and_its_modes_are_silent() -> None:
+def test_stm32_is_never_blocked_and_modes_are_silent() -> None:
     profile = parse_platform("stm32")
     frames = [parse_sent(wire(row["bytes"])) for row in PLATFORMS]
     assert {profile.block_s(frame) for frame in frames if frame} == {FRAME_S}
@@ -238,13 +240,13 @@ SPELLED: list[tuple[str, Frame, bytes]] = [
 
 
 @pytest.mark.parametrize(("platform", "frame", "data"), SPELLED)
-def test_a_frame_is_spelled_as_the_car_reads_it(platform: str, frame: Frame, data: bytes) -> None:
+def test_frame_encoding_depends_on_platform(platform: str, frame: Frame, data: bytes) -> None:
     profile = parse_platform(platform)
     assert profile.encode(frame) == data
     assert profile.parse_sent(data) == frame
 
 
-def test_a_frame_of_another_head_is_none() -> None:
+def test_frame_of_other_head_is_not_parsed() -> None:
     assert parse_platform("arduino+head=BALA").parse_sent(b"$4WD,MODE00#") is None
     assert parse_platform("arduino").parse_sent(b"$BALA,MODE00#") is None
     assert parse_platform("arduino").parse_sent(b"$3WD,MODE00#") is None
