@@ -47,9 +47,12 @@ def redecode(session: Path, cars: tuple[str, ...], platform: str | None, *, as_j
 
     if platform is not None:
         try:
+            decodes = drivers.family_name(platform) == drivers.YAHBOOM
             drivers.profile_of(platform)
         except ValueError as error:
             raise click.UsageError(f"--platform: {error}") from None
+        if not decodes:
+            raise click.UsageError(f"--platform: frames of {platform} cars are not decoded again, only `$...#` frames")
     try:
         found = _RedecodeReport(session, cars, platform)
         if session.suffix == ENDING:

@@ -175,6 +175,9 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     assert "no raw frames" in run("sessions", "redecode", foreign).output
     assert run("sessions", "redecode", tmp_path / "none").exit_code == 1
     assert run("sessions", "redecode", unknown, "--platform", "tank").exit_code == 2
+    other = run("sessions", "redecode", unknown, "--platform", "ugv_rover")
+    assert other.exit_code == 2
+    assert "ugv_rover" in other.output
 
     for text, words in (
         ("", "is not a vector"),
