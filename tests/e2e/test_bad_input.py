@@ -53,7 +53,7 @@ def gateway(fleet: FleetProcesses, tcp_car: TcpCar) -> GatewayProcess:
     [(RANDOM, {"no_start", "truncated", "unknown_word"}), (NEVER_ENDING, {"overlong", "no_start"})],
     ids=["random", "a frame that never ends"],
 )
-def test_a_megabyte_of_nonsense(
+def test_megabyte_of_nonsense_is_rejected_without_growth(
     fleet: FleetProcesses, tcp_car: TcpCar, gateway: GatewayProcess, nonsense: bytes, causes: set[str]
 ) -> None:
     before_mb = gateway.rss_mb()
@@ -69,7 +69,7 @@ def test_a_megabyte_of_nonsense(
 
 
 @pytest.mark.soak
-def test_a_link_that_takes_all_and_delivers_nothing(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
+def test_silent_link_keeps_recovery_going(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
     """The gateway reports that the car is silent, and goes on with recovery. A drive is sent, and nothing shows it."""
     gateway = fleet.gateway(tcp_car.link)
     wait_for(lambda: "silent since the stop began" in gateway.stderr, "it is said")
@@ -86,7 +86,7 @@ def test_a_link_that_takes_all_and_delivers_nothing(fleet: FleetProcesses, tcp_c
     assert fleet.state("safety").motors_basis == "shown"
 
 
-def test_a_car_that_echoes_everything_says_nothing(fleet: FleetProcesses) -> None:
+def test_echoes_are_no_readings(fleet: FleetProcesses) -> None:
     car = TcpCar(echoes=True)
     try:
         gateway = fleet.gateway(car.link)
@@ -115,7 +115,7 @@ def plugged_in(kept: list[int]) -> Path:
     return Path(os.ttyname(slave))
 
 
-def test_a_device_that_comes_back_as_another_number(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_by_id_path_reconnects_to_renumbered_device(fleet: FleetProcesses, tmp_path: Path) -> None:
     """Its by-id path, a symlink, stays the same."""
     sim, (link,) = fleet.simulate(f"red:arduino:pty:{tmp_path / 'by-id'}")
     fleet.gateway(link)
@@ -150,7 +150,7 @@ main()
 """
 
 
-def test_a_wall_clock_that_jumps_changes_no_motion(fleet: FleetProcesses) -> None:
+def test_wall_clock_jump_changes_no_motion(fleet: FleetProcesses) -> None:
     """Drives and stops use the monotonic clock. The wall clock only stamps messages and dates commands."""
     sim, (link,) = fleet.simulate("red:raspberry_pi:tcp")
     gateway = fleet.start("-c", A_CLOCK_THAT_JUMPS, "run", "--car", "red", "--link", link, "--platform", "raspberry_pi")
@@ -192,7 +192,7 @@ def test_a_wall_clock_that_jumps_changes_no_motion(fleet: FleetProcesses) -> Non
     [b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM11#" * 500, b"$" * 20_000],
     ids=["readings", "starts"],
 )
-def test_a_firehose_of_10_megabytes_a_second(
+def test_firehose_of_10_megabytes_per_second(
     fleet: FleetProcesses, tcp_car: TcpCar, gateway: GatewayProcess, nonsense: bytes
 ) -> None:
     before_mb = gateway.rss_mb()

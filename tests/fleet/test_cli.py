@@ -202,7 +202,7 @@ EVERY_COMMAND = list(contexts(cli.cli, click.Context(cli.cli, info_name="fleet",
 
 
 @pytest.mark.parametrize("context", EVERY_COMMAND[1:], ids=lambda context: context.command_path)
-def test_every_help_has_an_example_and_words_for_each_option(context: click.Context) -> None:
+def test_help_has_example_and_words_for_options(context: click.Context) -> None:
     command, shown = context.command, context.get_help()
     assert context.help_option_names == ["-h", "--help"]
     assert f"  {context.command_path}" in shown[shown.index("example") :]
@@ -218,7 +218,7 @@ def test_every_help_has_an_example_and_words_for_each_option(context: click.Cont
 
 
 @pytest.mark.parametrize("context", EVERY_COMMAND, ids=lambda context: context.command_path)
-def test_no_sentence_of_a_help_is_long(context: click.Context) -> None:
+def test_help_sentences_are_short(context: click.Context) -> None:
     command = context.command
     options = [param.help or "" for param in command.params if isinstance(param, click.Option)]
     without_examples = re.sub("\x08.*?(\n\n|$)", "", command.epilog or "", flags=re.DOTALL)
@@ -228,7 +228,7 @@ def test_no_sentence_of_a_help_is_long(context: click.Context) -> None:
 
 
 @pytest.mark.parametrize(("before", "after"), [("-e", ""), ("--endpoint", ""), ("", "--connect"), ("--connect", "-e")])
-def test_the_bus_may_be_named_before_and_after_the_command(before: str, after: str) -> None:
+def test_connect_option_works_before_and_after_command(before: str, after: str) -> None:
     nowhere, endpoint = free_endpoint(), free_endpoint()
     group = [before, nowhere if after else endpoint] if before else []
     result = CliRunner().invoke(cli.cli, [*group, "--fleet", "lab", "list", *([after, endpoint] if after else [])])
@@ -264,14 +264,14 @@ def test_no_running_fleet_is_failure_with_advice() -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_a_misspelled_state_of_the_fan_toggles_nothing(cars: Cars) -> None:
+def test_misspelled_fan_state_toggles_nothing(cars: Cars) -> None:
     done = run(cars.endpoint, "fan", "blue", "onn")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith('fleet: "onn" ')
     assert " mean on?" in done.stderr
 
 
-def test_a_fleet_without_cars(cars: Cars) -> None:
+def test_commands_fail_in_fleet_without_cars(cars: Cars) -> None:
     for command in (["list"], ["stop"], ["get", "red"]):
         done = run(cars.endpoint, *command, "--fleet", "empty")
         assert done.returncode == 1
@@ -366,7 +366,7 @@ def test_each_car_has_line_and_missing_car_exits_1(cars: Cars) -> None:
     ]
 
 
-def test_a_refusal_says_why(cars: Cars) -> None:
+def test_refused_command_says_why(cars: Cars) -> None:
     done = run(cars.endpoint, "mode", "blue", "tracking")
     assert done.returncode == 1
     assert done.stderr.startswith("blue: refused: blue (raspberry_pi) has no mode tracking. It has: ")
@@ -377,7 +377,7 @@ def test_a_refusal_says_why(cars: Cars) -> None:
     assert f"{LONG_S:g} s (longest_drive_s " in too_long.output
 
 
-def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
+def test_drive_command_waits_until_drive_is_over(cars: Cars) -> None:
     while STALE in (done := run(cars.endpoint, "drive", "green", "forward", "--for", "700ms")).stderr:
         pass
     assert done.returncode == 0
@@ -386,7 +386,7 @@ def test_a_drive_stays_until_it_is_over(cars: Cars) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_drive_stops_its_cars(cars: Cars, number: signal.Signals) -> None:
+def test_interrupted_drive_command_stops_its_cars(cars: Cars, number: signal.Signals) -> None:
     with driven(cars, "green", "blue") as drive:
         drive.send_signal(number)
         out, err = drive.communicate(timeout=60)
@@ -478,7 +478,7 @@ def completed(words: str, endpoint: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(FLEET, capture_output=True, text=True, check=True, env=environment)
 
 
-def test_the_shell_completes_connected_cars_and_words(cars: Cars) -> None:
+def test_shell_completes_cars_and_words(cars: Cars) -> None:
     # On a busy machine the cars may not answer in time. Then the shell gets no name, but never an error.
     wait_for(lambda: completed("fleet drive re", cars.endpoint).stdout == "plain,red\n", "the shell completes red")
     assert completed("fleet drive red fo", cars.endpoint).stdout == "plain,forward\n"

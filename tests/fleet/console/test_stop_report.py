@@ -18,7 +18,7 @@ def event(phase: str, verb: str = "stop", **fields: Any) -> Any:
     return pb.CommandEvent(verb=verb, phase=phase, **fields)
 
 
-def test_a_car_is_shown_only_by_a_complete_stop() -> None:
+def test_stop_report_shows_car_by_complete_stop_only() -> None:
     report = StopReport(1, "stop", "us", ["red", "blue", "green"], 10.0, 0)
     report.on_event("red", event("sent"), 10.1)
     report.on_event("blue", event("sent", basis="sent"), 10.2)
@@ -38,7 +38,7 @@ def test_complete_stop_without_basis_is_not_shown() -> None:
     assert states(report) == {"red": ("sent", ""), "blue": ("sent", "blue sends no readings")}
 
 
-def test_a_late_event_and_a_drive_change_nothing() -> None:
+def test_stop_report_ignores_drives_and_late_events() -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 0)
     report.on_event("red", event("complete", verb="drive"), 10.1)
     assert states(report)["red"][0] == "asked"
@@ -47,7 +47,7 @@ def test_a_late_event_and_a_drive_change_nothing() -> None:
     assert states(report)["red"][0] == "shown"
 
 
-def test_a_car_without_an_outcome_was_not_reached() -> None:
+def test_stop_report_of_car_without_outcome_is_failed() -> None:
     report = StopReport(1, "stop", "us", ["red", "blue"], 10.0, 0)
     answer = Outcome("blue", ok=False, phase="no_answer", words="its gateway went away")
     found = Outcome("green", ok=True, phase="complete", basis="shown")
@@ -66,7 +66,7 @@ def claim(at_s: float, since_s: float, basis: str = "sent") -> Any:
     return found
 
 
-def test_a_car_that_its_own_gateway_stops_later_is_shown() -> None:
+def test_stop_report_is_shown_by_later_safety_state() -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 50_000)
     report.on_safety("red", claim(50.1, 0.0, "shown"), 10.1)
     assert states(report)["red"][0] == "asked", "the state may be older than the stop"
@@ -93,7 +93,7 @@ def test_older_claim_is_no_result_of_undelivered_stop(old: Any) -> None:
     assert states(report)["red"][0] == "failed"
 
 
-def test_only_events_of_its_own_command_count_also_late() -> None:
+def test_stop_report_counts_events_of_own_command_only() -> None:
     report = StopReport(1, "stop", "us", ["red"], 10.0, 50_000)
     report.command_id = "this"
     report.on_event("red", event("complete", id="other", basis="shown"), 10.5)

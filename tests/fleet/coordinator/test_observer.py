@@ -50,7 +50,7 @@ def published(topic: str, message: object) -> Sample:
     return Sample(f"fleet/red/{topic}", payload, messages.encoding_of(name), 0, 1)
 
 
-def test_a_car_is_in_doubt_while_its_gateway_says_so() -> None:
+def test_car_is_doubted_while_gateway_says_so() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     assert not observer.cars["red"].doubted
@@ -128,7 +128,7 @@ def test_observer_ignores_message_of_wrong_type(topic: str, sent: str) -> None:
     assert observer.unconfirmed == set()
 
 
-def test_the_people_are_those_that_any_gateway_knows() -> None:
+def test_people_are_those_that_any_gateway_knows() -> None:
     observer = FleetObserver()
     come(observer, "red", 100.0)
     assert observer.people == NO_PEOPLE
@@ -180,7 +180,7 @@ def test_observer_knows_who_drives_or_holds_car(
     assert (observer.cars["red"].driven_by, observer.cars["red"].taken_by) == (driver, taken)
 
 
-def test_a_message_may_come_before_its_gateways_token() -> None:
+def test_message_may_come_before_token() -> None:
     observer = FleetObserver()
     observer.on_sample(said("sensor/range"), 100.0, None)
     come(observer, "red", 101.0)
@@ -188,7 +188,7 @@ def test_a_message_may_come_before_its_gateways_token() -> None:
     assert observer.cars["red"].mode == "tracking"
 
 
-def test_an_answer_whose_stamp_is_far_ahead_is_stale() -> None:
+def test_answer_with_stamp_far_ahead_is_stale() -> None:
     observer = FleetObserver()
     for ahead_s, at in ((9.0, 100.0), (11.0, -inf)):
         message = pb.Range(car="red", stamp=Timestamp(seconds=int(1e9 + ahead_s)))
@@ -197,7 +197,7 @@ def test_an_answer_whose_stamp_is_far_ahead_is_stale() -> None:
         assert observer.states["red"].newest_by_topic["sensor/range"].at == at
 
 
-def test_a_token_that_names_no_car_is_ignored() -> None:
+def test_token_of_invalid_name_is_ignored() -> None:
     observer = FleetObserver()
     observer.on_token("RED!", 100.0, alive=True)
     assert observer.present == set()

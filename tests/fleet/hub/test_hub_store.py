@@ -179,7 +179,7 @@ def test_ensure_keeps_remote_identity_unless_taken(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", [f"{ME}.key", f"{ME}.pem", "car.red.key", "hub.key", "hub.pem", "hub.json"])
 @pytest.mark.parametrize("text", ["", "junk"])
-def test_a_damaged_file_is_made_again(name: str, text: str, tmp_path: Path) -> None:
+def test_damaged_certificate_file_is_made_again(name: str, text: str, tmp_path: Path) -> None:
     store = store_in(tmp_path)
     (tmp_path / name).write_text(text)
     HubStore.load(store.credentials).ensure([car("red")], ME, addresses=["192.0.2.1"], now=NOW)
@@ -191,7 +191,7 @@ def test_a_damaged_file_is_made_again(name: str, text: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["ca.key", "ca.pem"])
-def test_a_damaged_authority_is_named(name: str, tmp_path: Path) -> None:
+def test_damaged_certificate_authority_is_named(name: str, tmp_path: Path) -> None:
     store = store_in(tmp_path)
     (tmp_path / name).write_text("junk")
     store.reserve(person("eve"), NOW)

@@ -102,7 +102,7 @@ def parsed(request: Request) -> tuple[Command, str]:
         ("find", {}, Find()),
     ],
 )
-def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> None:
+def test_payload_is_parsed_to_command(verb: str, payload: Any, what: Action) -> None:
     command = ask(verb, payload)
     assert command.what == what
     assert (command.verb, command.sender, command.streamed) == (verb, Sender("anonymous", Rank.SCRIPT), False)
@@ -114,19 +114,19 @@ def test_a_payload_becomes_a_command(verb: str, payload: Any, what: Action) -> N
             assert ask(verb, message.SerializeToString(), encoding).what == what
 
 
-def test_every_verb_of_the_table_is_known_here() -> None:
+def test_parser_knows_every_verb_once() -> None:
     for verb in COMMANDS:
         assert (verb, parsed(Request(verb, b"{}", messages.JSON))[0].verb) == (verb, verb)
     signals = [verb for verb, row in COMMANDS.items() if row.signal]
     assert sorted([*command_parser._WHAT, *PLAIN_ACTIONS, *signals, "drive"]) == sorted(COMMANDS), "each verb once"
 
 
-def test_the_fields_of_a_plain_action_are_flags() -> None:
+def test_plain_action_fields_are_flags() -> None:
     found = {field.name: field.type for action in PLAIN_ACTIONS.values() for field in fields(action)}
     assert all(each is bool for each in found.values())
 
 
-def test_the_message_of_a_signal_has_its_duration_at_most() -> None:
+def test_signal_message_has_duration_at_most() -> None:
     common = {field.name for field in pb.StopCommand.DESCRIPTOR.fields}
     for row in COMMANDS.values():
         if row.signal:
@@ -235,7 +235,7 @@ def test_estop_of_all_without_id_is_same_for_every_gateway() -> None:
     assert ask("resume", {}, by_wildcard=True).id != ask("resume", {}, by_wildcard=True).id
 
 
-def test_an_e_stop_for_an_unknown_scope_stops_this_car() -> None:
+def test_estop_of_unknown_scope_stops_this_car() -> None:
     assert ask("estop", {"scope": "world", "sender": "mia"}).what == EmergencyStop()
     assert "car (the default) and fleet" in ask("estop", {"scope": "world"}).note
 
@@ -245,13 +245,13 @@ def test_refusal_is_recorded_under_given_id_and_sender() -> None:
     assert (error.command.id, error.command.sender) == ("abc", Sender("mia", Rank.PERSON))
 
 
-def test_a_gateway_may_allow_longer_drives() -> None:
+def test_longest_drive_limit_is_configurable() -> None:
     payload = {"motion": "forward", "duration_s": 60}
     assert ask("drive", payload, longest_drive_s=60.0).what == Drive(Motion.FORWARD, 60.0)
     assert "at most 59 s" in refused("drive", payload, longest_drive_s=59.0).words
 
 
-def test_a_refused_stream_is_still_a_stream() -> None:
+def test_refused_streamed_command_is_still_streamed() -> None:
     for payload in ({"motion": "up"}, {}, b"\xff", None):
         error = refused("drive", payload, sampled_ns=NOW)
         assert error.command.streamed, "or each of 25 a second is recorded"
@@ -277,7 +277,7 @@ def test_zero_bytes_are_a_message_without_fields(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("verb", COMMANDS)
-def test_only_what_concerns_the_fleet_may_be_asked_by_wildcard(verb: str) -> None:
+def test_wildcard_is_for_fleet_commands_only(verb: str) -> None:
     if verb in ("stop", "estop", "resume", "pause", "unpause"):
         assert ask(verb, {}, by_wildcard=True).verb == verb
     else:

@@ -24,7 +24,7 @@ def estop(identity: str, *, fleet_wide: bool = True) -> Estop:
     return Estop(identity, "eve", "smoke", 7, fleet_wide)
 
 
-def test_an_e_stop_holds_and_the_hold_outlives_it() -> None:
+def test_estop_sets_hold_that_outlives_it() -> None:
     safety = Safety()
     safety.latch(estop("a"))
     safety.latch(estop("b", fleet_wide=False))
@@ -43,7 +43,7 @@ def test_fleet_estop_replaces_same_estop_of_car() -> None:
     assert [each.fleet_wide for each in safety.estops] == [True]
 
 
-def test_an_id_that_was_ended_is_latched_under_another_one() -> None:
+def test_ended_estop_id_is_latched_under_new_id() -> None:
     safety = Safety()
     safety.latch(estop("a"))
     safety.end(["a"])
@@ -83,7 +83,7 @@ def test_estops_are_bounded_and_fleet_one_always_fits() -> None:
     assert safety.latch(estop("later")) in safety.estops
 
 
-def test_only_fleet_wide_ids_are_united_and_ended_wins() -> None:
+def test_merge_unites_fleet_wide_estops_and_ended_wins() -> None:
     red, blue = Safety(), Safety()
     red.latch(estop("fleet"))
     red.latch(estop("own", fleet_wide=False))
@@ -176,7 +176,7 @@ def test_nobody_lowers_rank_of_foreign_estop_or_hold() -> None:
     assert safety.hold == Hold("eve", 1, Rank.LEAD)
 
 
-def test_a_loan_is_restored_for_the_time_that_is_left() -> None:
+def test_loan_is_restored_for_remaining_time() -> None:
     loan = Loan("bob", "eve", Rank.LEAD, 1_000_000_000, 10.0)
     safety = Safety.restore(PersistedSafety(loan=loan), now=500.0, now_ns=4_000_000_000)
     assert safety.loan_until == 507.0
@@ -186,7 +186,7 @@ def test_a_loan_is_restored_for_the_time_that_is_left() -> None:
     assert safety.persisted.loan == loan
 
 
-def test_a_lease() -> None:
+def test_lease_refuses_by_rank_and_expires() -> None:
     safety = Safety()
     safety.grant(SCRIPT, 10.0)
     lease = safety.lease_at(11.9)

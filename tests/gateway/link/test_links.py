@@ -183,7 +183,7 @@ async def test_close_while_a_read_is_pending(link: Link, peer: Peer) -> None:
     assert await pending == f"{peer.url} was closed"
 
 
-async def test_a_read_that_is_cancelled_loses_nothing(link: Link, peer: Peer) -> None:
+async def test_cancelled_read_loses_no_bytes(link: Link, peer: Peer) -> None:
     pending = asyncio.create_task(link.read())
     await asyncio.sleep(0)
     pending.cancel()
@@ -276,7 +276,7 @@ async def test_frames_from_several_writers_are_never_mixed(link: Link, peer: Pee
     assert peer.receive(sum(map(len, frames))) == b"".join(frames)
 
 
-async def test_nothing_is_left_behind(peer: Peer) -> None:
+async def test_closed_link_leaves_no_descriptors_or_threads(peer: Peer) -> None:
     await (await open_link(peer.url)).close()  # opens the descriptors that last as long as the loop
     if isinstance(peer, TcpPeer):
         peer.die()
@@ -307,7 +307,7 @@ async def test_nothing_is_left_behind(peer: Peer) -> None:
             await asyncio.sleep(0.01)
 
 
-async def test_a_real_reset(tmp_path: Path) -> None:
+async def test_tcp_reset_is_link_lost(tmp_path: Path) -> None:
     peer = TcpPeer()
     link = await open_link(peer.url)
     peer.send(FRAME[:5])
@@ -320,7 +320,7 @@ async def test_a_real_reset(tmp_path: Path) -> None:
     peer.close()
 
 
-async def test_a_write_that_meets_a_reset_is_not_called_written() -> None:
+async def test_write_after_tcp_reset_raises_link_lost() -> None:
     """The loop has not noticed the reset yet, so only the write itself can report it."""
     peer = TcpPeer()
     link = await open_link(peer.url)
@@ -332,7 +332,7 @@ async def test_a_write_that_meets_a_reset_is_not_called_written() -> None:
     peer.close()
 
 
-async def test_a_port_that_takes_nothing_never_holds_up_the_loop(tmp_path: Path) -> None:
+async def test_blocked_serial_write_does_not_block_loop(tmp_path: Path) -> None:
     """The write of pyserial itself would wait for a write_timeout, or spin.
 
     The best of several rounds counts, because the machine may be busy.
@@ -448,7 +448,7 @@ async def test_open_link_is_exclusive(link: Link, peer: Peer) -> None:
     await again.close()
 
 
-async def test_the_loop_runs_while_a_port_is_read(tmp_path: Path) -> None:
+async def test_serial_read_does_not_block_loop(tmp_path: Path) -> None:
     """A link has one thread. A read blocks that thread, and never the loop."""
     peer = PtyPeer(tmp_path)
     link = await open_link(peer.url)

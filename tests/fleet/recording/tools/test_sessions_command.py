@@ -48,7 +48,7 @@ def session(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_list_says_how_each_is(session: Path) -> None:
+def test_session_list_shows_state_of_each(session: Path) -> None:
     root = session.parent
     for name, closed in (("cut", False), ("damaged", True), ("newer", True)):
         shutil.copytree(session, root / name)
@@ -94,7 +94,7 @@ def test_the_list_says_how_each_is(session: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_list_of_damaged_sessions_has_each_of_them(seed: int, session: Path) -> None:
+def test_session_list_includes_damaged_sessions(seed: int, session: Path) -> None:
     rng = random.Random(seed)
     data, about = (session / "0001.mcap").read_bytes(), (session / "session.json").read_bytes()
     for number in range(8):
@@ -122,7 +122,7 @@ def test_info_has_versions_keys_and_marks(session: Path) -> None:
     assert about["keys"]["fleet/red/@cmd/drive"] == every_type.EACH
 
 
-def test_a_part_is_a_session_of_its_own(session: Path, tmp_path: Path) -> None:
+def test_cut_part_is_session_of_its_own(session: Path, tmp_path: Path) -> None:
     out = tmp_path / "part"
     done = fleet("cut", session, "--from", "50ms", "--to=-20ms", "--car", "red", "--out", out)
     assert done.returncode == 0, done.stderr
@@ -182,7 +182,7 @@ def test_files_that_went_are_told_also_the_last(session: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [None, "", '{"fleet": 3}'])
-def test_a_description_that_went_is_told(session: Path, text: str | None) -> None:
+def test_missing_session_description_is_reported(session: Path, text: str | None) -> None:
     (session / "session.json").unlink()
     if text is not None:
         (session / "session.json").write_text(text)
@@ -197,7 +197,7 @@ def test_a_description_that_went_is_told(session: Path, text: str | None) -> Non
     assert session_dir.SessionInfo.read(session.with_name(f"{session.name}-recovered")) is not None
 
 
-def test_a_cut_session_is_recovered_and_says_so(session: Path, tmp_path: Path) -> None:
+def test_truncated_session_is_recovered(session: Path, tmp_path: Path) -> None:
     path = session / "0001.mcap"
     path.write_bytes(path.read_bytes()[:-8])
     describe(session)
@@ -239,7 +239,7 @@ def test_sessions_commands_refuse_no_session_in_one_line(
     assert sorted(one.name for one in tmp_path.iterdir()) == ["x"]
 
 
-def test_a_foreign_recording_is_looked_into_and_exported(tmp_path: Path) -> None:
+def test_foreign_recording_is_shown_and_exported(tmp_path: Path) -> None:
     path = tmp_path / "robot.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -296,7 +296,7 @@ def test_parquet_without_its_package_says_how_to_have_it(
     assert not (tmp_path / "p").exists()
 
 
-def test_a_place_that_cannot_be_written_is_one_line(session: Path, tmp_path: Path) -> None:
+def test_unwritable_output_is_one_line(session: Path, tmp_path: Path) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("")
     for command, option in (("export", "--csv"), ("export", "--parquet"), ("cut", "--out"), ("recover", "--out")):

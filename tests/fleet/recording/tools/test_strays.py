@@ -36,7 +36,7 @@ def mixed(tmp_path: Path) -> Session:
 
 
 @pytest.mark.parametrize("name", ["state/link", "fleet.v1.Link", "Link", "red/state/link"])
-def test_the_named_type_is_taken_and_strays_are_counted(mixed: Session, name: str) -> None:
+def test_table_takes_named_type_and_counts_strays(mixed: Session, name: str) -> None:
     with pytest.warns(UserWarning, match=NAMED) as warned:
         table = mixed.to_arrow(name)
     assert table.num_rows == 50
@@ -58,13 +58,13 @@ def test_strays_are_tables_of_their_own(mixed: Session, tmp_path: Path) -> None:
     assert {path.stem: pq.read_table(path).num_rows for path in out.iterdir()} == done.rows
 
 
-def test_a_join_takes_the_named_types(mixed: Session) -> None:
+def test_join_takes_named_types(mixed: Session) -> None:
     with pytest.warns(UserWarning, match=NAMED):
         frame = mixed.joined("sensor/range", "state/link")
     assert frame["link.state"].tolist() == ["online"] * 3
 
 
-def test_only_strays_are_an_empty_table_of_the_own_type(tmp_path: Path) -> None:
+def test_strays_alone_give_empty_table_of_own_type(tmp_path: Path) -> None:
     made = Mixed(path := tmp_path / "0001.mcap")
     made.stray(LINK, RANGE)
     made.close()
@@ -86,7 +86,7 @@ def dated(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_date_beyond_2262_is_null_with_a_warning(dated: Path) -> None:
+def test_date_beyond_2262_is_null_with_warning(dated: Path) -> None:
     with pytest.warns(UserWarning, match=NAMED) as warned:
         table = Session(dated).to_arrow("event/command")
     assert len(warned) == 1

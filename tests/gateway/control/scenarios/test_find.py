@@ -30,7 +30,7 @@ BLINKS = {"arduino": ["off", WHITE, "off"], "stm32": ["off"], "raspberry_pi": ["
 
 
 @pytest.mark.parametrize("platform", BLINKS)
-def test_a_car_at_rest_blinks_and_beeps_and_never_moves(platform: str) -> None:
+def test_find_at_rest_blinks_and_beeps_without_motion(platform: str) -> None:
     pair = Pair(platform).ready()
     moved, sent = len(pair.car.motor_log), len(pair.sent)
     pair.ask(Find(), identity="f")
@@ -41,7 +41,7 @@ def test_a_car_at_rest_blinks_and_beeps_and_never_moves(platform: str) -> None:
 
 
 @pytest.mark.parametrize("platform", BLINKS)
-def test_a_car_that_drives_blinks_and_beeps_and_drives_on(platform: str) -> None:
+def test_find_while_driving_blinks_and_drives_on(platform: str) -> None:
     pair = Pair(platform).ready()
     pair.ask(Drive(Motion.FORWARD, 9.0))
     pair.run(2.0)
@@ -54,7 +54,7 @@ def test_a_car_that_drives_blinks_and_beeps_and_drives_on(platform: str) -> None
     assert pair.car.truth.motor_right > 0
 
 
-def test_the_led_is_what_it_was_before_also_after_two() -> None:
+def test_find_restores_led_color() -> None:
     pair = Pair().ready()
     pair.ask(Led(10, 20, 30))
     pair.run(3.0)
@@ -65,7 +65,7 @@ def test_the_led_is_what_it_was_before_also_after_two() -> None:
     assert seen(pair, 5.0) == [WHITE, COLOUR, WHITE, COLOUR]
 
 
-def test_a_colour_that_still_waits_is_what_is_left() -> None:
+def test_find_restores_led_color_that_was_queued() -> None:
     pair = Pair().ready()
     pair.ask(Find())
     pair.ask(Led(10, 20, 30))
@@ -74,7 +74,7 @@ def test_a_colour_that_still_waits_is_what_is_left() -> None:
     assert pair.car.truth.led == COLOUR
 
 
-def test_a_white_led_goes_dark_to_be_seen() -> None:
+def test_find_turns_white_led_dark() -> None:
     pair = Pair().ready()
     pair.ask(Led(255, 255, 255))
     pair.run(3.0)
