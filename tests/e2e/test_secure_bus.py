@@ -86,7 +86,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecureStage]:
 
 
 @pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED, BLUE, *map(service, Service)])
-def test_a_command_counts_under_ones_own_identity_only(identity: str, stage: SecureStage) -> None:
+def test_secure_command_counts_under_own_identity_only(identity: str, stage: SecureStage) -> None:
     others = [each for each in (ANN, MIA, RED, service(Service.COORDINATOR)) if each != identity]
     got: list[str] = []
     with stage.client(identity) as client:
@@ -106,7 +106,7 @@ def may(identity: str, verb: str, target: str) -> bool:
 
 
 @pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED, BLUE, service(Service.RECORDER)])
-def test_each_verb_is_allowed_or_refused_as_people_table_says(identity: str, stage: SecureStage) -> None:
+def test_verb_rights_follow_people_table(identity: str, stage: SecureStage) -> None:
     """The verbs that stop come last, since they hold and e-stop the cars. `arm` is refused before anybody is asked."""
     stage.free()
     wrong: list[str] = []
@@ -139,7 +139,7 @@ def test_command_under_another_name_is_refused_but_stop_holds(stage: SecureStage
             assert stage.fleet.state("safety").hold.by == "mia"
 
 
-def test_nobody_publishes_answers_or_stands_in_for_another(stage: SecureStage) -> None:
+def test_secure_bus_refuses_foreign_publications_and_answers(stage: SecureStage) -> None:
     stage.free()
     heard: list[str] = []
     asked: list[str] = []
@@ -186,7 +186,7 @@ def test_locator_publishes_poses_and_person_does_not(stage: SecureStage) -> None
         assert [each["x_m"] for each in mia.history("red/sensor/pose", last=9)] == [1.0, 2.0]
 
 
-def test_a_stream_drives_ones_own_car_and_no_other(stage: SecureStage) -> None:
+def test_secure_stream_drives_own_car_only(stage: SecureStage) -> None:
     stage.free()
     stage.fleet.ready("red")  # a stream that begins during a stop is held until it pauses
     with stage.client(MIA) as mia:
@@ -246,7 +246,7 @@ def foreign(directory: Path) -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("why", ["no certificate", "another authority", "expired", "not yet"])
-def test_a_stranger_gets_no_link(why: str, stage: SecureStage) -> None:
+def test_stranger_without_certificate_gets_no_link(why: str, stage: SecureStage) -> None:
     settings = foreign(stage.store.directory)[why]
     with pytest.raises(zenoh.ZError), stranger(stage.store.credentials, **settings):
         pass
@@ -266,7 +266,7 @@ def test_whose_certificate_has_ended_reads_so(begins: timedelta, words: str, sta
         Bus.open(stage.store.credentials.endpoint, timeout_s=0.5, identity=late)
 
 
-def test_a_certificate_that_no_rule_knows_gets_nothing(stage: SecureStage) -> None:
+def test_certificate_without_access_rule_gets_nothing(stage: SecureStage) -> None:
     """Somebody has the authority's key, or the hub's list was restored from an old copy."""
     directory = stage.store.directory
     ca = certificate_authority.KeyPair((directory / "ca.pem").read_bytes(), (directory / "ca.key").read_bytes())
@@ -278,7 +278,7 @@ def test_a_certificate_that_no_rule_knows_gets_nothing(stage: SecureStage) -> No
         assert stage.command(zoe, "person.zoe", "*", Verb.STOP) == []
 
 
-def test_a_false_hub_gets_no_client(stage: SecureStage, tmp_path: Path) -> None:
+def test_false_hub_gets_no_client(stage: SecureStage, tmp_path: Path) -> None:
     """Whoever has joined has a certificate of the same authority, and cannot be the hub with it."""
     settings = stage.store.credentials.of_client(MIA)["tls"]
     port = free_port()

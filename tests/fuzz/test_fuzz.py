@@ -6,25 +6,25 @@ from tests.fuzz import controller, decoder, driven, ugv_search
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_controller_to_which_anything_happens(seed: int) -> None:
+def test_fuzzed_controller(seed: int) -> None:
     written, stopped = controller.run(seed, 10_000, stop_every=100)
     assert written > 500
     assert stopped > 80
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_driven_car_to_which_anything_happens(seed: int) -> None:
+def test_fuzzed_driven_car(seed: int) -> None:
     done = driven.run(seed, 400)
     assert done.stops > 15
     assert len(done.states) > 5
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_decoder_that_is_fed_anything(seed: int) -> None:
+def test_fuzzed_decoder(seed: int) -> None:
     assert decoder.run(seed, 50_000) > 40_000
 
 
-def test_a_car_of_the_second_family_to_which_anything_happens() -> None:
+def test_fuzzed_waveshare_car() -> None:
     episodes = [ugv_search.play(seed) for seed in (*range(60), 1048, 1218, 4657)]
     assert {each.seed: each.faults for each in episodes if each.faults} == {}
     assert sum(each.drives for each in episodes) >= 60, "what may be done is done"

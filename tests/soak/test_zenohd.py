@@ -22,22 +22,22 @@ def stage(zenohd: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Se
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("identity", IDENTITIES)
-def test_a_command_counts_under_ones_own_identity_only(identity: str, stage: SecureStage) -> None:
-    test_secure_bus.test_a_command_counts_under_ones_own_identity_only(identity, stage)
+def test_secure_command_counts_under_own_identity_only(identity: str, stage: SecureStage) -> None:
+    test_secure_bus.test_secure_command_counts_under_own_identity_only(identity, stage)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("identity", [ANN, MIA, EVE, RED])
-def test_each_verb_is_allowed_or_refused_as_people_table_says(identity: str, stage: SecureStage) -> None:
-    test_secure_bus.test_each_verb_is_allowed_or_refused_as_people_table_says(identity, stage)
+def test_verb_rights_follow_people_table(identity: str, stage: SecureStage) -> None:
+    test_secure_bus.test_verb_rights_follow_people_table(identity, stage)
 
 
 @pytest.mark.soak
-def test_nobody_publishes_answers_or_stands_in_for_another(stage: SecureStage) -> None:
-    test_secure_bus.test_nobody_publishes_answers_or_stands_in_for_another(stage)
+def test_secure_bus_refuses_foreign_publications_and_answers(stage: SecureStage) -> None:
+    test_secure_bus.test_secure_bus_refuses_foreign_publications_and_answers(stage)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("why", ["no certificate", "another authority", "expired", "not yet"])
-def test_a_stranger_gets_no_link(why: str, stage: SecureStage) -> None:
-    test_secure_bus.test_a_stranger_gets_no_link(why, stage)
+def test_stranger_without_certificate_gets_no_link(why: str, stage: SecureStage) -> None:
+    test_secure_bus.test_stranger_without_certificate_gets_no_link(why, stage)

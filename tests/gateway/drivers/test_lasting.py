@@ -167,7 +167,7 @@ def lamp(request: pytest.FixtureRequest) -> Blinker:
     return made
 
 
-def test_a_signal_lasts_as_long_as_asked(lamp: Blinker) -> None:
+def test_lasting_signal_has_asked_duration(lamp: Blinker) -> None:
     blink = lamp.ask(MINUTE)
     assert lamp.life(blink)[-1] is Phase.SENT, "recorded when it begins"
     lamp.run(70.0)
@@ -180,7 +180,7 @@ def test_a_signal_lasts_as_long_as_asked(lamp: Blinker) -> None:
     assert lamp.life(blink)[-1] is Phase.SENT
 
 
-def test_a_stop_ends_what_lasts_at_once(lamp: Blinker) -> None:
+def test_stop_ends_lasting_action_at_once(lamp: Blinker) -> None:
     blink = lamp.ask(MINUTE)
     lamp.run(5.0)
     lamp.ask(Stop())
@@ -190,7 +190,7 @@ def test_a_stop_ends_what_lasts_at_once(lamp: Blinker) -> None:
     assert len(lamp.lit) == before
 
 
-def test_the_same_command_takes_the_place_of_what_lasts(lamp: Blinker) -> None:
+def test_same_command_replaces_lasting_action(lamp: Blinker) -> None:
     blink = lamp.ask(MINUTE)
     lamp.run(5.0)
     again = lamp.ask(Signal(Verb.WHISTLE, 2.0))
@@ -214,7 +214,7 @@ def test_other_commands_go_out_meanwhile(lamp: Blinker) -> None:
     assert lamp.life(blink)[-1] is Phase.SENT
 
 
-def test_an_action_of_many_frames_does_not_expire_while_they_go_out(lamp: Blinker) -> None:
+def test_action_of_many_frames_does_not_expire_while_sent(lamp: Blinker) -> None:
     find = lamp.ask(Find())
     lamp.run(MAX_QUEUE_TIME_S + 1.0)
     assert lamp.life(find)[-1] is Phase.QUEUED, "it lasts longer than a command may wait"
@@ -222,7 +222,7 @@ def test_an_action_of_many_frames_does_not_expire_while_they_go_out(lamp: Blinke
     assert lamp.life(find)[-1] is Phase.SENT
 
 
-def test_a_mode_does_not_wait_for_what_lasts_and_ends_it() -> None:
+def test_mode_ends_lasting_action_without_waiting() -> None:
     lamp = CarBlinker()
     blink = lamp.ask(MINUTE)
     lamp.run(5.0)

@@ -67,7 +67,7 @@ time.sleep(600)
 """
 
 
-def test_a_lock_ends_with_its_holder(tmp_path: Path) -> None:
+def test_file_lock_ends_with_its_holder(tmp_path: Path) -> None:
     path = tmp_path / "not" / "yet" / "there"
     with subprocess.Popen([sys.executable, "-c", HOLDS, str(path)], stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
@@ -85,7 +85,7 @@ def test_a_lock_ends_with_its_holder(tmp_path: Path) -> None:
     assert FileLock(path).try_take()
 
 
-def test_a_car_that_may_be_moving_goes_first(tmp_path: Path) -> None:
+def test_ble_turn_of_moving_car_goes_first(tmp_path: Path) -> None:
     holder, ordinary, other = (Turn("hci0", first=False, directory=tmp_path) for _ in range(3))
     first, second = (Turn("hci0", first=True, directory=tmp_path) for _ in range(2))
     assert holder.try_take()
@@ -151,7 +151,7 @@ async def test_connects_at_once_meet_no_refusal(peer: BlePeer) -> None:
 # ---------------------------------------------------------------------- adapters and their room
 
 
-async def test_a_link_uses_the_adapter_that_it_names(peer: BlePeer) -> None:
+async def test_ble_link_uses_named_adapter(peer: BlePeer) -> None:
     hci0, hci1 = peer.bluez.adapters
     for adapter, used in ((None, hci0), ("hci1", hci1), ("hci0", hci0)):
         link = await open_link(BleUrl(peer.module.address, adapter=adapter))
@@ -195,7 +195,7 @@ async def test_auto_goes_on_to_adapter_with_fewer_connections(peer: BlePeer) -> 
     await link.close()
 
 
-async def test_an_adapter_without_room_is_said(peer: BlePeer) -> None:
+async def test_full_ble_adapter_is_reported(peer: BlePeer) -> None:
     hci0, hci1 = peer.bluez.adapters
     hci0.slots = 3
     more(peer, 3, hci0)

@@ -120,7 +120,7 @@ def recorded(cars: Cars, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return session
 
 
-def test_the_same_plan_shows_no_difference(recorded: Path) -> None:
+def test_replan_of_same_plan_has_no_difference(recorded: Path) -> None:
     result = run("plan", "try", recorded, "--json")
     assert result.exit_code == 0, result.output
     summary = json.loads(result.output.splitlines()[-1])
@@ -154,7 +154,7 @@ def test_plan_try_shows_first_difference_with_readings(recorded: Path, tmp_path:
         ("idle", "manual", "manual (no role)"),
     ],
 )
-def test_a_state_is_shown_in_plain_words(kind: str, decided: str, words: str) -> None:
+def test_recorded_decision_has_plain_words(kind: str, decided: str, words: str) -> None:
     assert str(RecordedDecision(0, kind, decided, "")) == words
 
 
@@ -163,7 +163,7 @@ def test_redecode_of_replanned_session_has_no_difference(recorded: Path) -> None
     assert result.exit_code == 0, result.output
 
 
-def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp_path: Path) -> None:
+def test_replan_of_cut_recording_compares_from_its_begin(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "part"
     # The coordinator publishes the plan every ten seconds. Between the first two there is no other.
     first, second, *_ = (each.recorded_ns for each in Session(recorded).messages(["fleet/@coordinator/plan"]))
@@ -176,7 +176,7 @@ def test_a_recording_that_began_later_is_compared_from_there(recorded: Path, tmp
     assert (summary["differences"], summary["begun_before"]) == (0, 1), result.output
 
 
-def test_a_session_without_cars_that_were_decided_on_is_refused(recorded: Path, tmp_path: Path) -> None:
+def test_replan_refuses_session_without_decided_cars(recorded: Path, tmp_path: Path) -> None:
     for source, out, more in ((recorded, "red", ["--car", "red"]), (tmp_path / "red", "part", ["--from", "1s"])):
         assert run("sessions", "cut", source, *more, "--out", tmp_path / out).exit_code == 0
         result = run("plan", "try", tmp_path / out)
@@ -218,7 +218,7 @@ def state(at_s: float, boot: str) -> Recorded:
     return Recorded("fleet/red/state/link", payload, "fleet.v1.Link", "protobuf", at_ns, at_ns, 1)
 
 
-def test_a_car_was_there_as_long_as_its_states_came() -> None:
+def test_presence_lasts_while_states_come() -> None:
     states = [*(state(at, "a") for at in (1, 2, 3)), *(state(at, "b") for at in (3.4, 4)), state(9, "b")]
     found = presence(states, 20 * S)
     assert [(token.at_ns / S, token.alive) for token in found] == [
@@ -261,7 +261,7 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     assert run("plan", "try", without, "--tolerance", "0").exit_code == 2
 
 
-def test_a_sessions_fleet_file_may_name_its_plan_otherwise(tmp_path: Path) -> None:
+def test_replan_accepts_other_plan_name_in_fleet_file(tmp_path: Path) -> None:
     """The session has the plan as plan.yaml, and a car without a link was simulated then."""
     made = Made(tmp_path / "0001.mcap", Writer)
     for at in range(3):

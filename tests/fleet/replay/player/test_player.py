@@ -65,7 +65,7 @@ def play(fleet: FleetProcesses, session: Path, *more: str) -> GatewayProcess:
     return fleet.start("-m", "fleet.cli", "play", str(session), *more)
 
 
-def test_a_schedule_has_one_origin() -> None:
+def test_schedule_has_one_origin() -> None:
     every = Schedule(rate=3.0)
     assert [every.due_s(START_NS + number * S // 10) for number in range(4)] == pytest.approx([0, 1 / 30, 2 / 30, 0.1])
     # After 10^9 steps of a tenth of a second, the error is less than a thousandth.
@@ -175,7 +175,7 @@ def test_player_looks_like_fleet_and_takes_no_command(fleet: FleetProcesses, ses
     wait_for(lambda: not fleet.bus.tokens("fleet-replay/*"), "it is gone")
 
 
-def test_a_part_of_it_over_and_over(fleet: FleetProcesses, session: Path) -> None:
+def test_player_loops_over_selected_part(fleet: FleetProcesses, session: Path) -> None:
     got: list[bus.Sample] = []
     fleet.bus.subscribe("fleet-replay/**", got.append)
     part = ("--car", "red", "--from", "2s", "--to", "4s", "--offset", "1s", "--cars-only", "--loop", "--rate", "10")
@@ -199,7 +199,7 @@ def test_player_answers_with_values_from_before_offset(fleet: FleetProcesses, se
     assert player.end(signal.SIGINT) == 0
 
 
-def test_a_clock_that_went_back_is_not_waited_for(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_player_does_not_wait_for_clock_that_went_back(fleet: FleetProcesses, tmp_path: Path) -> None:
     recording = Made(tmp_path / "back.mcap", Writer)
     for at_s in (3600.0, 3600.1, 0.0, 0.1):
         recording.put("fleet/red/sensor/range", pb.Range(range_m=0.4), at_s)
@@ -223,7 +223,7 @@ def live(fleet: FleetProcesses, token: str) -> None:
         wait_for(lambda: other.tokens(token), "the hub knows of it")
 
 
-def test_a_name_that_is_a_living_fleets_is_refused(fleet: FleetProcesses, session: Path) -> None:
+def test_player_refuses_name_of_living_fleet(fleet: FleetProcesses, session: Path) -> None:
     live(fleet, "again/red")
     player = play(fleet, session, "--as", "again")
     assert player.wait() == 2
@@ -240,7 +240,7 @@ def test_a_name_that_is_a_living_fleets_is_refused(fleet: FleetProcesses, sessio
     assert play(fleet, session, "--as", "tried", "--cars-only", "--rate", "100").wait() == 0
 
 
-def test_the_recorded_fleet_is_not_spoken_for(fleet: FleetProcesses, session: Path) -> None:
+def test_player_refuses_name_of_recorded_fleet(fleet: FleetProcesses, session: Path) -> None:
     player = play(fleet, session, "--as", "fleet")
     assert player.wait() == 2
     assert "--as fleet " in player.stderr
@@ -263,7 +263,7 @@ def test_commands_of_a_recording_are_not_given_again(fleet: FleetProcesses, tmp_
     assert player.published == 1
 
 
-def test_a_hub_that_is_killed_is_replaced(fleet: FleetProcesses, session: Path) -> None:
+def test_player_replaces_killed_hub(fleet: FleetProcesses, session: Path) -> None:
     player = play(fleet, session, "--loop")
     wait_for(lambda: fleet.get("fleet-replay/red/state/mode"), "something was said")
     fleet.hub.kill()

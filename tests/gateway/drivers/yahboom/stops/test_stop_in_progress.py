@@ -69,7 +69,7 @@ def test_stop_at_any_moment_ends_within_announced_time(case: StopTestCase) -> No
 
 
 @pytest.mark.parametrize("case", RESTORED, ids=str)
-def test_a_stop_on_a_link_that_was_just_restored(case: StopTestCase) -> None:
+def test_stop_on_restored_link_stops_car(case: StopTestCase) -> None:
     for seed in range(MOMENTS):
         judge(play(case, seed))
 
@@ -144,7 +144,7 @@ def test_single_actions_wait_for_no_evidence() -> None:
         pair.run(0.7)
 
 
-def test_a_recovery_keeps_the_color_that_is_set_during_it() -> None:
+def test_recovery_keeps_color_that_is_set_during_it() -> None:
     pair = Pair(start_s=2.0).ready()
     pair.cut = 9
     pair.ask(Drive(Motion.FORWARD, 5.0))
@@ -161,7 +161,7 @@ def test_a_recovery_keeps_the_color_that_is_set_during_it() -> None:
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
 @pytest.mark.parametrize("world", [World.room, World.open_field], ids=["echo", "no-echo"])
-def test_a_drive_that_is_over_stops_the_car_softly(platform: str, world: Callable[[], World]) -> None:
+def test_soft_stop_at_end_of_drive_is_in_time(platform: str, world: Callable[[], World]) -> None:
     """A soft stop takes 0.02 s, up to 1.0 s without an echo, and 1.1 s with a frame of ours in the buffer.
 
     The source is docs/reference/protocol.md#stops.
@@ -187,7 +187,7 @@ def test_a_drive_that_is_over_stops_the_car_softly(platform: str, world: Callabl
         )
 
 
-def test_a_mode_is_never_opened_while_the_motors_are_on() -> None:
+def test_mode_never_opens_while_motors_are_on() -> None:
     for seed in range(40):
         moments = random.Random(seed)
         pair = Pair(seed=seed, world=moments.choice([World.room, World.open_field])(), start_s=2.0).ready()
@@ -263,7 +263,7 @@ def test_stop_case_over_whole_input_product() -> None:
         assert stop_in_progress.recovery(situation).rank <= max(full.rank, sequences.RECOVERY.rank)
 
 
-def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
+def test_stop_recipes_send_known_frames_only() -> None:
     for situation in situations():
         profile = parse_platform("arduino") if situation.open_mode else situation.profile
         for recipe in (
@@ -275,7 +275,7 @@ def test_no_recipe_sends_what_the_platform_does_not_know() -> None:
                 assert profile.refusal(step.frame) is None, (situation, recipe)
 
 
-def test_every_recipe_ends_alone_in_the_buffer() -> None:
+def test_stop_recipes_end_alone_in_buffer() -> None:
     """The last frame comes 1.1 s after the frame before it, or waits until the car has read that frame."""
     for situation in situations():
         for recipe in (stop_in_progress.full(situation), stop_in_progress.soft(situation)):
