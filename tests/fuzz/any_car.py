@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from gateway.control.commands import Action, Drive, SetLight, SetMode, Stop
+from gateway.drivers.yahboom.executor import FREE_ACTIONS
 from gateway.drivers.yahboom.protocol.frames import ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
@@ -66,6 +67,8 @@ SHARP_S = 0.1
 FALSE_S = 0.3
 MODE_STAYS_S = 8.0
 LONGEST_FIRST_FRAMES_S = 1.1 + 1.2 + 4.3
+LONGEST_STOP_S = 18.0
+"""Maximum time within which a car shows a stop, if it can (docs/reference/protocol.md#repeated-stops)."""
 """Maximum time for which the first frames of a stop delay a command: their length, the block before and a turn."""
 
 
@@ -97,7 +100,8 @@ class UseEpisode:
         )
         self.use = Use(seed, [], self.car, [])
         self._false_since: float | None = None
-        self._lit_at: float | None = None
+        self._lit_at: list[float] = []
+        """When the lights were written."""
 
     def play(self) -> Use:
         """Connect, and send some commands at random moments."""
@@ -126,10 +130,8 @@ class UseEpisode:
         asked_at, count = pair.now, len(pair.records)
         free_at = max(asked_at, control.driver.stops.free_at(asked_at))
         wait_s = control.wait_s(what, asked_at)
-        pacing = control.driver.model.pacing
-        if isinstance(what, SetLight) and not self._has_echo and self._lit_at == pacing.written_at:
-            # An action waits until the car has read the action before it.
-            wait_s = max(wait_s, min(pacing.buffer_until - asked_at, REPEAT_INTERVAL_S))
+        if isinstance(what, SetLight):
+            wait_s = max(wait_s, self._light_wait_s)
         if free_at - asked_at > LONGEST_FIRST_FRAMES_S + self._longest_block_s:
             self._violate(f"(5) {what} would wait for {free_at - asked_at:.1f} s")
         self.use.commands.append(f"{asked_at:.2f} {what}")
@@ -146,6 +148,17 @@ class UseEpisode:
             self._violate(f"(5) {what} is not on the wire after {bound - asked_at:.2f} s")
             return None
         return pair.sent[-1][0]
+
+    @property
+    def _light_wait_s(self) -> float:
+        """Return the longest time that an action on a part of the car may wait for the actions before it, s."""
+        control, now = self.pair.control, self.pair.now
+        running, pacing = control.driver.stops.running, control.driver.model.pacing
+        if running is not None and sum(at > running.began_at for at in self._lit_at) >= FREE_ACTIONS:
+            return LONGEST_STOP_S  # a stream of actions waits for the stop
+        if not self._has_echo and pacing.written_at in self._lit_at:
+            return min(pacing.buffer_until - now, REPEAT_INTERVAL_S)  # until the car has read the last one
+        return 0.0
 
     @property
     def _longest_block_s(self) -> float:
@@ -211,7 +224,8 @@ class UseEpisode:
         self._stop()
 
     def _light(self) -> None:
-        self._lit_at = self._ask(SetLight(Light.RED))
+        if (lit_at := self._ask(SetLight(Light.RED))) is not None:
+            self._lit_at.append(lit_at)
 
     def _stop(self) -> None:
         pair = self.pair
