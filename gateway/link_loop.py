@@ -129,7 +129,7 @@ class LinkLoop:
             data = await link.read()
             read_at = now = self._loop.time()
             self.health.on_bytes(len(data), now)
-            self._on_gap(now)  # first, because reports that are read late may look like a pause of the car
+            self._on_gap(now)  # first, because reports that are read late may look like a block gap of the car
             before = shown_state(self._driver.model)
             for start in range(0, len(data), SLICE_BYTES):
                 if start:

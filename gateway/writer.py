@@ -58,7 +58,7 @@ class Writer:
     async def _write_due(self) -> None:
         """Write the frames that are due."""
         now = self._loop.time()
-        self._on_gap(now)  # first, because reports that are decoded late may look like a pause of the car
+        self._on_gap(now)  # first, because reports that are decoded late may look like a block gap of the car
         self._link.on_events(self._driver.flush(now))
         while (link := self._link.link) is not None and (write := self._next_frame()) is not None:
             self._driver.sends(write.data, self._loop.time())  # an echo may arrive before the write returns

@@ -78,7 +78,7 @@ def frames(port: Tty, frame: bytes, rate_hz: float) -> Iterator[None]:
 
 
 def play_car(port: Tty, until: Callable[[], bool], report: Callable[[], bytes] = lambda: READING) -> None:
-    """Send reports as a car in mode 0 does, and pause after each `MODE00`, until a condition holds."""
+    """Send reports as a car in mode 0 does, and block after each `MODE00`, until a condition holds."""
     deadline = monotonic() + PATIENCE_S
     report_at = monotonic()
     while not until():

@@ -101,7 +101,7 @@ def test_echoes_are_no_readings(fleet: FleetProcesses) -> None:
         good_frame_counts(fleet, car.send)
         assert fleet.state("safety").motors == "unknown", "a reading alone confirms no stop"
         car.obey()
-        wait_for(lambda: fleet.state("safety").motors == "off", "pauses in its reports confirm one")
+        wait_for(lambda: fleet.state("safety").motors == "off", "block gaps in its reports confirm one")
         assert fleet.state("safety").motors_basis == "shown"
         assert gateway.popen.poll() is None
     finally:

@@ -31,12 +31,12 @@ def _no_second_try(patch: Patch) -> None:
     patch(StopCase, "probes", lambda self, facts: False)
 
 
-def _one_pause(patch: Patch) -> None:
-    patch(evidence, "PAUSES", 1)
+def _one_gap(patch: Patch) -> None:
+    patch(evidence, "BLOCK_GAPS", 1)
 
 
-def _pauses_of_any_length(patch: Patch) -> None:
-    patch(evidence, "PAUSES_IN_DOUBT", evidence.PAUSES)
+def _gaps_of_any_length(patch: Patch) -> None:
+    patch(evidence, "BLOCK_GAPS_IN_DOUBT", evidence.BLOCK_GAPS)
 
 
 def _damaged_frames_count(patch: Patch) -> None:
@@ -109,8 +109,8 @@ def _commands_wait_for_ever(patch: Patch) -> None:
 RULES: dict[str, Callable[[Patch], None]] = {
     "evidence decides, not time": _time_decides,
     "what is not shown is sent again": _no_second_try,
-    "one pause is not enough": _one_pause,
-    "nor are two, if one does not match the normal interval": _pauses_of_any_length,
+    "one block gap is not enough": _one_gap,
+    "nor are two, if one does not match the normal interval": _gaps_of_any_length,
     "damaged frames are no reports": _damaged_frames_count,
     "a frame with a silence in it is none": _frames_continue_after_a_silence,
     "a report long after MODE00 does not show that a mode was left": _any_report_shows_that_a_mode_was_left,

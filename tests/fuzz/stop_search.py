@@ -199,7 +199,7 @@ def _theme(seed: int, load: str, load_s: float, faults: tuple[LinkFault, ...], *
 
 
 def _report_swallowed(seed: int, moments: random.Random) -> EpisodePlan:
-    """Lose the stop and the report after it, so that the reports pause as if the car had obeyed."""
+    """Lose the stop and the report after it, so that the next report is late as if the car had obeyed."""
     gap = LinkFault(Kind.DEAD, Way.BOTH, moments.uniform(-0.2, 0.0), moments.uniform(0.5, 1.9))
     return _theme(
         seed, moments.choice(["drive", "steer"]), moments.uniform(0.5, 4.0), (gap,),

@@ -83,7 +83,8 @@ FOUND = (
         ),
         traits=CarTraits(interval_s=2.125256673661981, close_s=1.3),
     ),
-    # A held report, and a `MODE00` that lost a digit and so blocked longer, made two pauses. Few intervals were known.
+    # A held report, and a `MODE00` that lost a digit and so blocked longer, made two block gaps. Few intervals were
+    # known.
     EpisodePlan(
         548956, "arduino", "arduino", "echo", "drive", 3.023257620828898, Ending.STOP,
         (

@@ -31,7 +31,7 @@ def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
 async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(
     fleet: FleetProcesses, car: TcpCar, tmp_path: Path
 ) -> None:
-    """The car obeys one `MODE00`, but not the next. The loop stalls until the gap of reports looks like a pause."""
+    """The car obeys one `MODE00`, but not the next. The loop stalls until the gap of reports looks like a block gap."""
     shown: list[int] = []
 
     def listen(sample: bus.Sample) -> None:
@@ -46,12 +46,12 @@ async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(
     async with served(fleet, car.link, tmp_path):
         await until_closed(1)
         car.obey()
-        await until_closed(3)  # after the first pause the gateway writes the next MODE00 at once
+        await until_closed(3)  # after the first block gap the gateway writes the next MODE00 at once
         time.sleep(REPORT_S)  # noqa: ASYNC251 - the loop stalls
         car.send(REPORT)  # as if the car had not received MODE00
         time.sleep(2.2 - REPORT_S)  # noqa: ASYNC251
         await asyncio.to_thread(wait_for, lambda: shown or car.received.count(MODE00) > 3, "it goes on")
-        assert not shown, "one pause is no evidence"
+        assert not shown, "one block gap is no evidence"
 
 
 async def test_a_line_of_text_is_no_reading_and_no_damage(fleet: FleetProcesses, car: TcpCar, tmp_path: Path) -> None:

@@ -275,7 +275,7 @@ class TcpCar:
         self._peers[-1].sendall(data)
 
     def obey(self, report: bytes = REPORT) -> None:
-        """Behave as a car in mode 0 from now on: send reports, and pause after each `MODE00`."""
+        """Behave as a car in mode 0 from now on: send reports, and block after each `MODE00`."""
         with self._turn:
             self._report, self._report_at = report, time.monotonic()
             self._turn.notify()

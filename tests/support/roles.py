@@ -33,7 +33,7 @@ FILL_S: Final = 3.0
 NOTICED_S: Final = 4.5
 """Maximum time to notice a reset. Three contradicting frames show a reset, one a second."""
 SHOWN_S: Final = 4.0
-"""Maximum time until the car has shown the stop before the next mode. Two pauses in its reports show a stop."""
+"""Maximum time until the car has shown the stop before the next mode. Two block gaps in its reports show a stop."""
 IN_FORCE_S: Final = 3.5 + 1.0
 """Maximum time from a filled role to its mode: the longest opening (docs/reference/protocol.md#blocking-times), 1 s."""
 STRAY_S: Final = 2.5

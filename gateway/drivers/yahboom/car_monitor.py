@@ -96,7 +96,7 @@ class CarMonitor:
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
         if model.stop_style is StopStyle.TIMER and Blocking.MODE_CLOSE in model.learned.blocks:
-            words = f"its reports pause after MODE00, unlike those of {model.profile.name} cars"
+            words = f"its reports come late after MODE00, unlike those of {model.profile.name} cars"
             if model.platform.note(words):
                 self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
         if only_candidate(event) is Mode.MANUAL:

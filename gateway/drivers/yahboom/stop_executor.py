@@ -22,7 +22,7 @@ from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
 from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
-_PROBED: Final = (Finding.REPORT, Finding.PAUSE, Finding.CONTROL)
+_PROBED: Final = (Finding.REPORT, Finding.BLOCK_GAP, Finding.CONTROL)
 """Findings after which a stop that the car may still show continues with its next frame, a probe or a control."""
 
 
@@ -173,7 +173,7 @@ class StopExecutor:
     # ------------------------------------------------------------------ tries
 
     def settle(self, running: StopInProgress, now: float) -> None:
-        """End the stop if no reading has followed its last pause too early, which shows it."""
+        """End the stop if no reading has followed its last block gap too early, which shows it."""
         if self.model.evidence.settle(now):
             self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
 
@@ -358,7 +358,7 @@ class StopExecutor:
             self.begin(self.full(now), FrameOrigin.STOP, now)
 
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
-        """Send the stop again at once, because the reports have continued without a pause.
+        """Send the stop again at once, because the reports have continued without a block gap.
 
         The case decides, because the reports of a Raspberry Pi always continue.
         """

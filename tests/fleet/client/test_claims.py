@@ -13,7 +13,7 @@ from fleet.client.claims import (
 )
 from schemas.gen import fleet_v1_pb2 as pb
 
-SHOWN = pb.Safety(motors="off", motors_basis="shown", trust_evidence="2 pauses", trust_since_s=3.0)
+SHOWN = pb.Safety(motors="off", motors_basis="shown", trust_evidence="2 gaps", trust_since_s=3.0)
 
 
 def test_a_claim_has_its_basis_its_time_and_its_age() -> None:
@@ -25,7 +25,7 @@ def test_a_claim_has_its_basis_its_time_and_its_age() -> None:
         "basis": "shown",
         "since_s": 3.5,
         "age_s": 0.5,
-        "words": "off (shown) for 4 s: 2 pauses",
+        "words": "off (shown) for 4 s: 2 gaps",
     }
     assert motors_claim(pb.Safety(motors="on")).short == "on"
 

@@ -644,7 +644,7 @@ def test_unanswered_recovery_goes_on_with_growing_pauses() -> None:
     assert (desk.control.driver.model.motors, desk.control.driver.model.basis) == ("off", Basis.SHOWN)
 
 
-def test_reports_alone_confirm_nothing_and_two_pauses_do() -> None:
+def test_reports_alone_confirm_nothing_and_two_block_gaps_do() -> None:
     desk = Workbench()
     desk.control.link_up(desk.now)
     desk.pump()

@@ -33,7 +33,7 @@ RUN = b"$1,0,0,0,0,0,0,0,0#"
 BACK = b"$2,0,0,0,0,0,0,0,0#"
 MODE00 = b"$4WD,MODE00#"
 SHOWN_STOP = [MODE00, STOP, MODE00]
-"""Frames of a stop in mode 0 until the car has shown it. Each `MODE00` makes a pause. Two pauses are needed, and
+"""Frames of a stop in mode 0 until the car has shown it. Each `MODE00` makes a block gap. Two are needed, and
 no frame may follow the last one."""
 
 PERSON = Sender("mia", Rank.PERSON)

@@ -68,7 +68,7 @@ class StopCase:
     probes: Callable[[StopFacts], bool] = _no
     """Returns True if the car could react to a `MODE00` now, and show it."""
     repeats_lost: bool = True
-    """True if the stop is sent again at once when the reports continue without a pause."""
+    """True if the stop is sent again at once when the reports continue without a block gap."""
     is_sure: bool = True
     """True if the car counts as standing still after a stop that ended this way."""
     renews_whole: bool = False
@@ -129,7 +129,7 @@ LEFT_SHAPE: Final = StopCase(
     "full stop, out of a mode in which the car sent readings",
     "one report of mode 0 that the car began after it obeyed `MODE00`, and that comes within the block and one "
     "interval. No other frame was sent since the mode was seen. A report that comes up to 0.2 s later counts as one "
-    "pause. In all other cases as in mode 0",
+    "block gap. In all other cases as in mode 0",
     "the stop goes on",
 )
 LEFT_SILENT: Final = StopCase(
@@ -142,8 +142,8 @@ LEFT_SILENT: Final = StopCase(
 MANUAL: Final = StopCase(
     "manual",
     "full stop or recovery, in mode 0 with a sonar echo",
-    "two pauses, each after a `MODE00` of its own; three if one of them is in doubt. After the last one, no reading "
-    "comes too early, and the gateway has sent no frame since its `MODE00`",
+    "two block gaps, each after a `MODE00` of its own; three if one of them is in doubt. After the last one, no "
+    "reading comes too early, and the gateway has sent no frame since its `MODE00`",
     "the stop goes on, but a command may take its place",
     rule=_ends_in_mode_0,
     probes=_probes_in_mode_0,

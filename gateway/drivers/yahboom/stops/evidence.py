@@ -4,36 +4,36 @@ The car acknowledges nothing. A gateway only knows the frames that it wrote, and
 This essay is about what those times can prove, what they cannot, and what is still doubtful. Two frames stop a car. The
 general stop ends a motion of mode 0, and other modes ignore it. `MODE00` brakes and closes any mode.
 
-*Why pauses.* On most cars `MODE00` makes the program beep, which blocks it for about a second. Meanwhile the car sends
-nothing, so the next report comes later by just that second. This delay is the acknowledgement that the protocol lacks.
-The general stop does not block, so no reading ever shows it. That is why a stop that is to be shown ends with a lone
-`MODE00`, and why no other frame of ours may follow it: the link could turn a general stop that is written after the
-evidence into a motion, and no evidence would judge that frame. The frame that is judged must be the last one.
+*Why block gaps.* On most cars `MODE00` makes the program beep, which blocks it for about a second. Meanwhile the car
+sends nothing, so the next report comes later by just that second. This delay is the acknowledgement that the protocol
+lacks. The general stop does not block, so no reading ever shows it. That is why a stop that is to be shown ends with a
+lone `MODE00`, and why no other frame of ours may follow it: the link could turn a general stop that is written after
+the evidence into a motion, and no evidence would judge that frame. The frame that is judged must be the last one.
 
 *Why not one number.* How often a car reports, and for how long `MODE00` blocks it, are properties of its program
 (docs/reference/protocol.md#programs-that-people-have). Reports come every 0.7 s from one car and every 2.2 s from
-another. So nothing here compares a car with a constant: `Learned` has the rhythm and the blocks of this car, and a
-pause is an interval that is longer than the rhythm by just the block. A car that reports by a timer never pauses. So
-its stops are never shown. That has no other disadvantage: they end as `sent`, and the text says why.
+another. So nothing here compares a car with a constant: `Learned` has the rhythm and the blocks of this car. A *block
+gap* is an interval that is longer than the rhythm by just the block. A car that reports by a timer has no block gaps,
+so its stops are never shown. That has no other disadvantage: they end as `sent`, and the text says why.
 
-*Why not one pause.* A link that loses both `MODE00` and the report after it leaves a gap, too: two intervals instead of
-one. If the interval is about as long as the block, that gap looks like a pause. On a car that reports every second,
-half of all outages of 0.6 s around a stop look like that. So two pauses are needed, each around its own `MODE00`. Three
-are needed if one of them is in doubt. A pause is in doubt if it is too long: the link may be slow, or may have held a
-report. While few intervals have been seen, it is also in doubt if it differs from the block by more than those
-intervals differ from each other.
+*Why not one block gap.* A link that loses both `MODE00` and the report after it doubles the interval. If the interval
+is about as long as the block, that looks like a block gap. On a car that reports every second, half of all outages of
+0.6 s around a stop look like that. So two block gaps are needed, each around its own `MODE00`. Three are needed if one
+of them is in doubt. A block gap is in doubt if it is too long: the link may be slow, or may have held a report. While
+few intervals have been seen, it is also in doubt if it differs from the block by more than those intervals differ from
+each other.
 
 *Why a control.* A half-duplex link receives nothing for a moment at each write. If the car does not receive our frames
-either, each `MODE00` seems to make a pause, for ever. Often the length of the gap shows whether a report was lost or
-the car was blocked. It does not if the block is about a whole number of intervals. Then the gateway writes a general
-stop a third of an interval after a report. This frame does not block, so the next report must come on time. Suppose
-that the link made the pauses, because it is mute after each write until the report after `MODE00` is lost. Then it is
-mute for as long after the general stop, so it loses this report, too, however much the intervals differ. So if the
-report is missing or damaged, the link made the pauses.
+either, each `MODE00` seems to make a block gap, for ever. Often the length of the interval shows whether a report was
+lost or the car was blocked. But if the block is about a whole number of intervals, it does not. Then the gateway writes
+a general stop a third of an interval after a report. This frame does not block, so the next report must come on time.
+Suppose that the link made the block gaps, because it is mute after each write until the report after `MODE00` is lost.
+Then it is mute for as long after the general stop, so it loses this report, too, however much the intervals differ. So
+if the report is missing or damaged, the link made the block gaps.
 
-*Why silence must follow.* A link that holds reports makes gaps of any length. But the held report comes late, and the
-next one on time, so the interval after the gap is too short. Therefore the last pause counts only after the time in
-which such a report would have come.
+*Why silence must follow.* A link that holds reports makes intervals of any length. But the held report comes late, and
+the next one on time, so the interval after that is too short. Therefore the last block gap counts only after the time
+in which such a report would have come.
 
 *Modes.* If a car reports in a mode, the form of its next report shows that it left the mode. On a car that was seen to
 block, one report is enough, if it comes at the right time. It must not come too early: the car must have begun it after
@@ -46,7 +46,7 @@ counts only after a silence that no such mode has. The start of one frame and th
 decoder ends a frame at a silence, and damage of any kind ends the comparison of intervals.
 
 *What is still doubtful.* A link that flips bits could turn the judged `MODE00` into another frame that blocks as long,
-but no such frame is known. A car that by itself pauses twice at just the right times would be believed. And a
+but no such frame is known. A car that by itself reports late twice at just the right times would be believed. And a
 half-duplex link whose mute time changes from write to write can pass the control by chance.
 """
 
@@ -75,19 +75,21 @@ EARLY_S: Final = 0.05
 WIRE_S: Final = 0.02
 """Minimum time from the end of a block to the arrival of the report after it: a report takes longer on the wire."""
 LATE_S: Final = 0.2
-"""Additional time on a slow link for the report that shows the end of a mode. Such a late report is only a pause."""
+"""Additional time on a slow link for the report that shows the end of a mode. A report in this time is only a block
+gap."""
 OTHER_MODE_LINGERS_S: Final = 1.0
 """Maximum time for which readings of a mode still arrive after the `MODE00` that ends it."""
 LONGER_S: Final = 0.65
-"""Maximum time by which a pause may be longer than the block. Such a pause is in doubt."""
-PAUSES: Final = 2
-"""Number of pauses that show a stop in mode 0."""
-PAUSES_IN_DOUBT: Final = 3
-"""Number of pauses that are needed if one of them is in doubt."""
+"""Maximum time by which a block gap may be longer than the block. Such a block gap is in doubt."""
+BLOCK_GAPS: Final = 2
+"""Number of block gaps that show a stop in mode 0."""
+BLOCK_GAPS_IN_DOUBT: Final = 3
+"""Number of block gaps that are needed if one of them is in doubt."""
 MISFITS: Final = 2
-"""After this many intervals that are neither normal nor a pause, the rhythm is measured again without a `MODE00`."""
+"""After this many intervals that are neither normal nor a block gap, the gateway measures the rhythm again, without a
+`MODE00`."""
 SETTLING_S: Final = 0.25
-"""Minimum time without a reading after the last pause, before the pauses count."""
+"""Minimum time without a reading after the last block gap, before the block gaps count."""
 OTHER_MODE_READINGS: Final = 2
 """After this many consecutive readings in the form of another mode, the car is in that mode."""
 ROUND_TRIP_S: Final = 2.5
@@ -107,14 +109,14 @@ class Finding(StrEnum):
     """A report of mode 0 whose sonar heard an echo. No `MODE00` is waiting for it, so one could be judged now."""
     UNJUDGED = "unjudged"
     """The same, but the rhythm of the car is not known, so a `MODE00` could not be judged now."""
-    PAUSE = "pause"
-    """A pause. More are needed."""
+    BLOCK_GAP = "block_gap"
+    """A block gap. More are needed."""
     CONTROL = "control"
-    """A pause that the link may have made by itself. The next frame must be the control: one that does not block."""
+    """A block gap that the link may have made by itself. The next frame must be the control, which does not block."""
     SETTLING = "settling"
-    """The last needed pause. The stop is shown if no reading follows too early."""
+    """The last needed block gap. The stop is shown if no reading follows too early."""
     LOST = "lost"
-    """The reports continued without a pause."""
+    """The reports continued without a block gap."""
     NO_ECHO = "no_echo"
     """A report of mode 0 without an echo."""
     SHOWN = "shown"
@@ -147,7 +149,7 @@ class StopEvidence:
     words: str = ""
     """The evidence for `SHOWN`."""
     settles_at: float | None = None
-    """When the pauses count, unless a reading arrives earlier. None if there are not enough pauses."""
+    """When the block gaps count, unless a reading arrives earlier. None if there are not enough block gaps."""
     without_echo: int = 0
     """Number of consecutive reports without an echo."""
     changed_expectation: bool = False
@@ -166,16 +168,16 @@ class StopEvidence:
     """The delay of the first report after that `MODE00`. None if it is not known."""
     _delayed: int = 0
     """Number of this stop's `MODE00` frames after which the first report was late, but not by the block."""
-    _pauses: int = 0
-    _pauses_needed: int = PAUSES
+    _block_gaps: int = 0
+    _gaps_needed: int = BLOCK_GAPS
     _unjudged: bool = False
-    """True if a frame was written after the `MODE00` that the next pause would judge."""
+    """True if a frame was written after the `MODE00` that the next block gap would judge."""
     _controlled: bool = False
     """True if the control of this stop was passed: the report after a frame that does not block came on time."""
     _blocks: list[_Block] = field(default_factory=list)
     """The other frames that block, written since the last report."""
     _misfits: int = 0
-    """Number of intervals with a `MODE00` that were neither normal nor a pause. Another program may be running."""
+    """Number of intervals with a `MODE00` that were neither normal nor a block gap. Another program may be running."""
     _ended_with_echo: bool = False
     """True if the last bytes were a report with an echo, also if it arrived too early to count."""
     _other_frame_written: bool = False
@@ -229,7 +231,7 @@ class StopEvidence:
 
     @property
     def settling_s(self) -> float:
-        """Return the time to wait after the last pause. If the link had held its report, the next comes earlier."""
+        """Return the time to wait after the last block gap. If the link had held its report, the next comes earlier."""
         return max(0.0, self.interval_s - self.close_s) + SETTLING_S
 
     # ------------------------------------------------------------------ frames
@@ -243,14 +245,14 @@ class StopEvidence:
         self.on_motion()
 
     def begin_stop(self) -> None:
-        """Prepare for another stop. Keep the pauses of the last stop, but not its control."""
+        """Prepare for another stop. Keep the block gaps of the last stop, but not its control."""
         self.settles_at = None
         self._controlled = False
         self._delayed = 0
 
     def on_motion(self) -> None:
         """Drop the evidence, because the car may drive now."""
-        self._drop_pauses()
+        self._drop_gaps()
         if self._mode_00_at is not None:  # that `MODE00` will not be judged any more, but it blocks the car
             self._blocks.append(_Block(None, self.close_s, self._mode_00_at))
         self._mode_00_at = self.settles_at = None
@@ -278,7 +280,7 @@ class StopEvidence:
             self._blocks.append(_Block(kind, block_s, now))
 
     def on_mode_00(self, now: float, *, awake: bool) -> None:
-        """Record a `MODE00`. With `awake`, no frame of ours blocks the car, so the pause will be exactly its block."""
+        """Record a `MODE00`. With `awake`, no other frame of ours blocks the car: its block gap will be exact."""
         self._mode_00_at = now if awake else None
         if not awake:
             self._blocks.append(_Block(None, self.close_s, now))  # so that this interval does not count
@@ -307,7 +309,7 @@ class StopEvidence:
     def reset_times(self) -> None:
         """Drop the evidence that depends on times, because a stall of the loop made the times of reports wrong."""
         self._echo_report_at = self._no_echo_report_at = self._mode_00_at = self.settles_at = None
-        self._drop_pauses()
+        self._drop_gaps()
 
     def is_credible(self, event: Sensors) -> bool:
         """Return False for a report of mode 0 just after other frames: it may be a damaged frame of another mode."""
@@ -319,7 +321,7 @@ class StopEvidence:
         has_echo, is_report = bool(event.range_cm), Mode.MANUAL in candidate_modes(event)
         self._last_at = at
         self.changed_expectation = False
-        # If this report comes a normal interval after the last pause, the link did not hold the report before it.
+        # If this report comes a normal interval after the last block gap, the link did not hold the report before it.
         on_time = self.settles_at is not None and silence_s >= self.interval_s - self._rhythm.tolerance_s
         if on_time and is_report:
             self._echo_report_at = at if has_echo else None
@@ -335,7 +337,7 @@ class StopEvidence:
             self._learn_faster(at, silence_s, has_echo=has_echo)
             self._echo_report_at = self._no_echo_report_at = None
             if silence_s < min(BUNCHED_S, BUNCHED_SHARE * self.learned.interval_s(FASTEST_S)):
-                self._drop_pauses()
+                self._drop_gaps()
             return Finding.NOTHING
         self._ended_with_echo = has_echo
         if event.range_cm is None:  # the frame is damaged, and does not show whether there is an echo
@@ -358,7 +360,7 @@ class StopEvidence:
             return self._on_obeyed(at)
         if not has_echo:
             return self._on_report_without_echo(before_no_echo, at, blocks)
-        if left is Finding.PAUSE:
+        if left is Finding.BLOCK_GAP:
             return self._count_late_leaving(at)
         mode_00_at = self._mode_00_at
         if mode_00_at is None:
@@ -384,7 +386,7 @@ class StopEvidence:
         return Finding.NO_ECHO
 
     def settle(self, now: float) -> bool:
-        """Return True if the pauses count from now on, because no reading has followed them too early."""
+        """Return True if the block gaps count from now on, because no reading has followed them too early."""
         if self.settles_at is None or now < self.settles_at:
             return False
         self.settles_at = None
@@ -402,14 +404,14 @@ class StopEvidence:
         """Learn from an interval without a `MODE00`: the rhythm, the delay of another frame, or the control."""
         if before is None:
             if other_written:
-                self._drop_pauses()  # there was damage instead of a report after the control
+                self._drop_gaps()  # there was damage instead of a report after the control
             return self._report_finding
         gap_s = at - before
         if not blocks:
             if other_written and self._rhythm.is_known:
                 self._controlled = self._rhythm.fits(gap_s)
                 if not self._controlled:
-                    self._drop_pauses()  # writing makes the link lose reports
+                    self._drop_gaps()  # writing makes the link lose reports
                     return self._report_finding
             self._learn_interval(gap_s)
         elif len(blocks) == 1 and (kind := blocks[0].kind) is not None and self._rhythm.is_known:
@@ -438,7 +440,7 @@ class StopEvidence:
         if self.learned.add_interval(gap_s, echo=True):
             self.changed_expectation = True
             self._misfits = 0
-            self._drop_pauses()
+            self._drop_gaps()
 
     def _judge_interval(self, before: float, mode_00_at: float, at: float, blocks: list[_Block]) -> Finding:
         """Judge the interval of two reports. `MODE00` was written at `mode_00_at`."""
@@ -455,32 +457,32 @@ class StopEvidence:
         longer = -tolerance_s <= delay_s - close_s <= LONGER_S
         if close_s > 2 * tolerance_s and (matches or longer):
             self._mode_00_at = None
-            # Require more pauses if there are too few intervals to know their spread, or if an earlier `MODE00`, which
-            # was not judged, may have delayed this report.
+            # Require more block gaps if too few intervals are known to tell their spread, or if an unjudged earlier
+            # `MODE00` may have delayed this report.
             seen_s = rhythm.seen_tolerance_s
             is_close = -seen_s <= delay_s - close_s <= blocked_s + seen_s
             if not is_close or any(each.kind is None for each in blocks):
-                self._pauses_needed = PAUSES_IN_DOUBT
-            return self._count_pause(at, delay_s, learn=not matches)
+                self._gaps_needed = BLOCK_GAPS_IN_DOUBT
+            return self._count_gap(at, delay_s, learn=not matches)
         if after_s <= self._older_reports_s and gap_s <= rhythm.median_s + SAME_S:
             return Finding.NOTHING
         self._mode_00_at = None
         first_delay_s, self._first_delay_s = self._first_delay_s, None
         if first_delay_s is not None and self._count_other_delay(first_delay_s):
-            # This car blocks for another time than expected. The equal delays before this one were pauses, too.
-            self._pauses = self._pauses_needed
-            return self._count_pause(at, first_delay_s)
-        # Here the interval is no pause. If the rhythm is not firm yet, let it become firm before the next `MODE00`.
-        no_pause = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
+            # This car blocks for another time than expected. The equal delays before this one were block gaps, too.
+            self._block_gaps = self._gaps_needed
+            return self._count_gap(at, first_delay_s)
+        # The interval is not a block gap. If the rhythm is not firm yet, let it become firm before the next `MODE00`.
+        no_gap = Finding.REPORT if rhythm.is_firm else Finding.UNJUDGED
         max_spread_s = max(SAME_S, 2 * tolerance_s) if rhythm.is_firm else tolerance_s
         if abs(delay_s) > max_spread_s:
-            self._drop_pauses()
+            self._drop_gaps()
             self._misfits += 1
-            return Finding.UNJUDGED if self._misfits >= MISFITS else no_pause
+            return Finding.UNJUDGED if self._misfits >= MISFITS else no_gap
         if first_delay_s is not None and abs(first_delay_s) > max_spread_s:
-            return no_pause
+            return no_gap
         self._misfits = 0
-        self._drop_pauses()
+        self._drop_gaps()
         if not blocks and rhythm.fits(gap_s):
             self._learn_interval(gap_s)
         if self.profile.close_s > 2 * tolerance_s:
@@ -490,16 +492,16 @@ class StopEvidence:
     def _count_other_delay(self, delay_s: float) -> bool:
         """Count a delay that is not the expected block. Return True if enough delays of this stop agree."""
         self._delayed += 1
-        return self._add_close(delay_s) and self._delayed >= PAUSES
+        return self._add_close(delay_s) and self._delayed >= BLOCK_GAPS
 
     def _add_close(self, delay_s: float) -> bool:
         """Learn from the delay after a `MODE00`. Return True if the last delays agree."""
         kind, longest_s = Blocking.MODE_CLOSE, self.profile.reopened_s
         return self.learned.add_delay(kind, delay_s, longest_s, controlled=self._controlled)
 
-    def _count_pause(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
-        """Count a pause. With `learn`, its length is not the expected one, but may be the block of this car."""
-        self._pauses += 1
+    def _count_gap(self, at: float, delay_s: float, *, learn: bool = False) -> Finding:
+        """Count a block gap. With `learn`, its length is not the expected one, but may be the block of this car."""
+        self._block_gaps += 1
         self.reacted_at = at
         self._first_delay_s = None
         self._misfits = 0
@@ -508,14 +510,14 @@ class StopEvidence:
             self._add_close(delay_s)
         if not self._controlled and self.learned.is_confusable(delay_s):
             return Finding.CONTROL
-        if self._pauses < self._pauses_needed or self._unjudged:
-            return Finding.PAUSE
-        self.words = f"{self._pauses} pauses in its reports, each after MODE00"
+        if self._block_gaps < self._gaps_needed or self._unjudged:
+            return Finding.BLOCK_GAP
+        self.words = f"{self._block_gaps} gaps in its reports, each after MODE00"
         self.settles_at = at + self.settling_s
         return Finding.SETTLING
 
-    def _drop_pauses(self) -> None:
-        self._pauses, self._pauses_needed, self._controlled = 0, PAUSES, False
+    def _drop_gaps(self) -> None:
+        self._block_gaps, self._gaps_needed, self._controlled = 0, BLOCK_GAPS, False
 
     def _on_other_mode(self, at: float) -> None:
         """Record a reading in the form of another mode."""
@@ -523,13 +525,13 @@ class StopEvidence:
         self._foreign_at = at
         self._echo_report_at = self._no_echo_report_at = None
         self._ended_with_echo = False
-        self._drop_pauses()
+        self._drop_gaps()
         if self._other_mode_readings >= OTHER_MODE_READINGS or self._other_mode_at is not None:
             self._other_mode_at = at
             self._silent_mode = None
 
     def _judge_leaving(self, at: float, silence_s: float, within_s: float) -> Finding:
-        """Return SHOWN if this report shows that `MODE00` alone closed the mode, PAUSE if it comes too late for that.
+        """Return SHOWN if this report shows that `MODE00` alone closed the mode. Return BLOCK_GAP if it comes too late.
 
         `within_s` is the maximum time from `MODE00` to a report that shows it.
         """
@@ -552,22 +554,22 @@ class StopEvidence:
         self.words = f"a report of mode 0 {at - closed_at:.1f} s after MODE00, out of {mode}"
         # A car that was never seen to block may send a report in the middle of a block, with the motors on.
         is_judged = at <= closed_at + within_s and not self._unjudged and self.learned.shows is Shows.YES
-        return Finding.SHOWN if is_judged else Finding.PAUSE
+        return Finding.SHOWN if is_judged else Finding.BLOCK_GAP
 
     def _count_late_leaving(self, at: float) -> Finding:
-        """Count a report that shows too late that the car left its mode. It is the first pause, no more."""
+        """Count a report that shows too late that the car left its mode. It is the first block gap, no more."""
         self.reacted_at = at
         self._mode_00_at = None
-        self._drop_pauses()
-        self._pauses = 1
-        return Finding.PAUSE
+        self._drop_gaps()
+        self._block_gaps = 1
+        return Finding.BLOCK_GAP
 
     def _on_obeyed(self, at: float) -> Finding:
         """Begin anew, because the stop is shown."""
         self.reacted_at = at
         self._mode_00_at = None
         self.settles_at = None
-        self._drop_pauses()
+        self._drop_gaps()
         self._older_reports_s = 0.0
         self._forget_mode()
         self.learned.on_shown()

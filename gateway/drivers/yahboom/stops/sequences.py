@@ -114,8 +114,8 @@ BOTH_MANUAL: Final = StopSequence(
     ),
 )
 
-# Tests whether a car in mode 0 receives frames: if it does, its reports pause for the block of `MODE00`. No frame
-# follows, so that the judged frame is the last one.
+# Tests whether a car in mode 0 receives frames: if it does, the next report is late by the block of `MODE00`. No
+# frame follows, so that the judged frame is the last one.
 PROBE: Final = StopSequence("probe", 3, (Step(_MANUAL, Gate.ALONE),))
 
 CONTROL_SHARE: Final = 0.35

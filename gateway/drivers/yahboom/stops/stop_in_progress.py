@@ -23,8 +23,8 @@ _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After that the command fails."""
 EVIDENCE_INTERVALS: Final = 5
-"""Minimum of that timeout, as a number of intervals with a pause: three pauses (because one may be in doubt), the
-report before them, and the silence after them. The maximum of the timeout is `MAX_EVIDENCE_TIMEOUT_S`."""
+"""Minimum of that timeout, as a number of block gaps: three that may be needed (because one may be in doubt), one for
+the report before them, and one for the silence after them. The maximum of the timeout is `MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case that is added to that timeout, so that nobody waits longer than 17 s for an answer, or 23 s
 with the slowest car."""

@@ -18,10 +18,10 @@ from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.drivers.yahboom.stops.evidence import (
+    BLOCK_GAPS,
     EARLY_S,
     LATE_S,
     LONGER_S,
-    PAUSES,
     ROUND_TRIP_S,
     WIRE_S,
     Finding,
@@ -36,7 +36,7 @@ from tests.support.virtual import Pair
 ECHO = b"$4WD,CSB57.24,PV7.91,GS5,LF0000,HW00,GM00#"
 SILENT = b"$4WD,CSB0.00,PV7.91,GS5,LF0000,HW00,GM00#"
 TRACKING = b"$4WD,CSB0,PV8,GS0,LF1001,HW00,GM00#"
-NOTHING, REPORT, PAUSE, LOST = Finding.NOTHING, Finding.REPORT, Finding.PAUSE, Finding.LOST
+NOTHING, REPORT, BLOCK_GAP, LOST = Finding.NOTHING, Finding.REPORT, Finding.BLOCK_GAP, Finding.LOST
 SETTLING, SHOWN, CONTROL, UNJUDGED = Finding.SETTLING, Finding.SHOWN, Finding.CONTROL, Finding.UNJUDGED
 ARDUINO = parse_platform("arduino")
 INTERVAL_S, BLOCK_S = 1.25, 1.0
@@ -74,8 +74,8 @@ class EvidenceWatch:
         """Record that `MODE00` was written."""
         self.evidence.on_mode_00(at, awake=awake)
 
-    def pause(self, at: float, block_s: float = BLOCK_S) -> Finding:
-        """Feed a report at `at`, a `MODE00`, and the report after its pause. Return the finding."""
+    def gap(self, at: float, block_s: float = BLOCK_S) -> Finding:
+        """Feed a report at `at`, a `MODE00`, and the report after its block gap. Return the finding."""
         self.reports(at)
         self.closed(at + 0.2)
         end = at + self.interval_s + block_s
@@ -90,52 +90,52 @@ class EvidenceWatch:
 @pytest.mark.parametrize(
     ("reports", "found"),
     [
-        ([9.5, 11.75], [PAUSE]),
-        ([8.8, 11.05], [PAUSE]),
+        ([9.5, 11.75], [BLOCK_GAP]),
+        ([8.8, 11.05], [BLOCK_GAP]),
         ([9.5, 11.75 - TOLERANCE_S - 0.01], [REPORT]),
-        ([9.5, 11.75 + LONGER_S - 0.01], [PAUSE]),  # in doubt: one more is needed
+        ([9.5, 11.75 + LONGER_S - 0.01], [BLOCK_GAP]),  # in doubt: one more is needed
         ([9.5, 11.75 + LONGER_S + 0.01], [REPORT]),
         ([9.5, 10.75, 12.0], [NOTHING, LOST]),
         ([9.98, 11.23], [LOST]),
-        ([9.4, 10.65, 12.9], [NOTHING, PAUSE]),  # the car sent the second one before it read MODE00
+        ([9.4, 10.65, 12.9], [NOTHING, BLOCK_GAP]),  # the car sent the second one before it read MODE00
         ([9.4, 10.65, 12.5], [NOTHING, REPORT]),  # another block, of a servo, lies between
         ([9.1, 10.9, 11.3], [NOTHING, NOTHING]),  # the link delayed a report, so the next one is too close
         ([11.5], [REPORT]),  # nothing is known about the time before this report
         ([], []),
     ],
 )
-def test_pause_around_mode00_is_found_once(reports: list[float], found: list[Finding]) -> None:
+def test_block_gap_around_mode00_is_found_once(reports: list[float], found: list[Finding]) -> None:
     watch = EvidenceWatch()
     before = [at for at in reports if at <= 10.0]
     watch.reports(*before)
     watch.closed(10.0)
     assert watch.reports(*(at for at in reports if at > 10.0)) == found
-    assert (watch.evidence.reacted_at is not None) == (PAUSE in found)
+    assert (watch.evidence.reacted_at is not None) == (BLOCK_GAP in found)
 
 
 @pytest.mark.parametrize("interval_s", [0.32, 0.71, 1.254, 1.493, 2.2, 3.0])
 def test_two_pauses_show_a_stop_and_one_does_not(interval_s: float) -> None:
     watch = EvidenceWatch(known(interval_s))
     each_s = interval_s + BLOCK_S
-    first = watch.pause(10.0)
-    assert first is (CONTROL if watch.learned.is_confusable(BLOCK_S) else PAUSE)
+    first = watch.gap(10.0)
+    assert first is (CONTROL if watch.learned.is_confusable(BLOCK_S) else BLOCK_GAP)
     if first is CONTROL:
         watch.evidence.on_other_frame()
         assert watch.reports(10.0 + each_s + interval_s) == [REPORT]
-        assert watch.pause(10.0 + each_s + 2 * interval_s) is SHOWN
+        assert watch.gap(10.0 + each_s + 2 * interval_s) is SHOWN
     else:
-        assert watch.pause(10.0 + each_s + interval_s) is SHOWN
-    assert watch.evidence.words == "2 pauses in its reports, each after MODE00"
-    assert PAUSES == 2
+        assert watch.gap(10.0 + each_s + interval_s) is SHOWN
+    assert watch.evidence.words == "2 gaps in its reports, each after MODE00"
+    assert BLOCK_GAPS == 2
 
 
 def test_three_pauses_are_needed_if_one_exceeds_block() -> None:
-    """A link that delays a report, and a damaged frame that opens mode 0 for 2.3 s, make two gaps like pauses."""
+    """A link that delays a report, and a damaged frame that opens mode 0 for 2.3 s, make two gaps like block gaps."""
     watch = EvidenceWatch()
-    assert watch.pause(10.0, 1.4) is PAUSE
-    assert watch.pause(10.0 + 2 * INTERVAL_S + 1.4) is PAUSE
-    assert watch.pause(10.0 + 4 * INTERVAL_S + 1.4 + BLOCK_S) is SHOWN
-    assert watch.evidence.words == "3 pauses in its reports, each after MODE00"
+    assert watch.gap(10.0, 1.4) is BLOCK_GAP
+    assert watch.gap(10.0 + 2 * INTERVAL_S + 1.4) is BLOCK_GAP
+    assert watch.gap(10.0 + 4 * INTERVAL_S + 1.4 + BLOCK_S) is SHOWN
+    assert watch.evidence.words == "3 gaps in its reports, each after MODE00"
 
 
 def test_pause_with_second_block_may_be_longer() -> None:
@@ -143,7 +143,7 @@ def test_pause_with_second_block_may_be_longer() -> None:
     watch.reports(10.0)
     watch.evidence.on_block(Blocking.WHISTLE, 0.3, 10.1)
     watch.closed(10.5)
-    assert watch.reports(12.35) == [PAUSE]
+    assert watch.reports(12.35) == [BLOCK_GAP]
     watch.closed(12.4)
     assert watch.reports(14.6) == [SETTLING], "neither was in doubt"
 
@@ -151,10 +151,10 @@ def test_pause_with_second_block_may_be_longer() -> None:
 def test_only_last_stop_frame_is_judged() -> None:
     """A general stop after `MODE00` could become a motion on its way, and nothing would show it."""
     watch = EvidenceWatch()
-    assert watch.pause(10.0) is PAUSE
+    assert watch.gap(10.0) is BLOCK_GAP
     watch.closed(12.3)
     watch.evidence.on_other_frame()
-    assert watch.reports(14.5) == [PAUSE]
+    assert watch.reports(14.5) == [BLOCK_GAP]
     watch.closed(14.6)
     assert watch.reports(16.75) == [SETTLING]
 
@@ -186,16 +186,16 @@ def test_delay_longer_than_time_since_mode_00_is_not_its_own() -> None:
 
 def test_pauses_before_a_motion_do_not_count() -> None:
     watch = EvidenceWatch()
-    assert watch.pause(40.0) is PAUSE
+    assert watch.gap(40.0) is BLOCK_GAP
     watch.evidence.on_motion()
-    assert watch.pause(43.5) is PAUSE, "the car may have moved since the first one"
+    assert watch.gap(43.5) is BLOCK_GAP, "the car may have moved since the first one"
 
 
 def test_lost_report_differs_from_pause_by_length() -> None:
-    """The link loses `MODE00` and the report after it, three times: 2.50 s, where a pause is 2.25 s."""
+    """The link loses `MODE00` and the report after it, three times: 2.50 s, where a block gap is 2.25 s."""
     watch = EvidenceWatch()
     for number in range(3):
-        assert watch.pause(10.0 + 5 * number, INTERVAL_S) not in (SETTLING, SHOWN)
+        assert watch.gap(10.0 + 5 * number, INTERVAL_S) not in (SETTLING, SHOWN)
     assert watch.learned.blocks == {}
 
 
@@ -242,7 +242,7 @@ def test_deaf_car_shows_nothing_even_with_lost_report(
 def test_bunched_reports_begin_anew(gaps: list[float]) -> None:
     """The times of reports that a stuck link delivers at once do not show when the car sent them."""
     watch = EvidenceWatch()
-    assert watch.pause(10.0) is PAUSE
+    assert watch.gap(10.0) is BLOCK_GAP
     at = 12.25
     for gap_s in gaps:
         at += gap_s
@@ -256,7 +256,7 @@ def test_report_too_early_after_last_pause_was_held_by_link(interval_s: float) -
     """The link holds a report for a second. The next one comes an interval after it was due."""
     watch = EvidenceWatch(known(interval_s))
     each_s = interval_s + BLOCK_S
-    if watch.pause(10.0) is CONTROL:
+    if watch.gap(10.0) is CONTROL:
         watch.evidence.on_other_frame()
     else:
         watch.evidence.on_other_frame()  # in both cases one interval without a MODE00
@@ -278,7 +278,7 @@ def test_damaged_bytes_begin_anew(when: str) -> None:
     watch.closed(10.5)
     if when == "within":
         watch.evidence.on_noise(10.9)
-    assert watch.reports(12.25)[-1] not in (PAUSE, SHOWN, SETTLING)
+    assert watch.reports(12.25)[-1] not in (BLOCK_GAP, SHOWN, SETTLING)
 
 
 def test_stop_frame_behind_own_block_shows_nothing() -> None:
@@ -291,7 +291,7 @@ def test_stop_frame_behind_own_block_shows_nothing() -> None:
 
 def test_reset_times_forgets_pause_after_loop_slept() -> None:
     watch = EvidenceWatch()
-    assert watch.pause(10.0) is PAUSE
+    assert watch.gap(10.0) is BLOCK_GAP
     watch.reports(13.5)
     watch.closed(13.9)
     watch.evidence.reset_times()
@@ -317,7 +317,7 @@ def test_report_without_echo_shows_no_stop(without: int) -> None:
     found += watch.reports(14.0, frame=SILENT if without == 2 else ECHO)
     assert found[without] is Finding.NO_ECHO
     assert SHOWN not in found
-    assert (PAUSE in found) == (without == 2)
+    assert (BLOCK_GAP in found) == (without == 2)
 
 
 # ---------------------------------------------------------------------- what is learned
@@ -332,7 +332,7 @@ def test_pause_is_unjudged_before_rhythm_is_known() -> None:
     assert watch.reports(14.5) == [REPORT], "an undisturbed interval: 1.25 s"
     assert watch.learned.echo.median_s == pytest.approx(INTERVAL_S)
     watch.closed(14.6)
-    assert watch.reports(16.75) == [PAUSE]
+    assert watch.reports(16.75) == [BLOCK_GAP]
 
 
 @pytest.mark.parametrize("block_s", [0.2, 0.5, 1.3, 1.8])
@@ -341,7 +341,7 @@ def test_three_delays_that_agree_are_the_block_of_this_car(block_s: float) -> No
     found = []
     for number in range(6):
         at = 10.0 + number * (3 * INTERVAL_S + block_s)
-        found.append(watch.pause(at, block_s))
+        found.append(watch.gap(at, block_s))
         watch.evidence.on_other_frame()
         watch.reports(at + 2 * INTERVAL_S + block_s)  # the control: on time
     assert SHOWN in found
@@ -354,7 +354,7 @@ def test_car_that_never_reacts_cannot_show_stop() -> None:
     watch = EvidenceWatch(known(shows=Shows.UNKNOWN))
     found_out = []
     for number in range(UNREACTED):
-        assert watch.pause(10.0 + 5 * number, 0.0) is LOST
+        assert watch.gap(10.0 + 5 * number, 0.0) is LOST
         found_out.append(watch.evidence.changed_expectation)
     assert found_out == [False] * (UNREACTED - 1) + [True]
     assert watch.learned.shows is Shows.NO
@@ -363,18 +363,18 @@ def test_car_that_never_reacts_cannot_show_stop() -> None:
 def test_car_that_showed_stop_stays_able_to_show() -> None:
     watch = EvidenceWatch()
     for number in range(3 * UNREACTED):
-        assert watch.pause(10.0 + 5 * number, 0.0) is LOST
+        assert watch.gap(10.0 + 5 * number, 0.0) is LOST
     assert watch.learned.shows is Shows.YES
 
 
 def test_whistle_that_delays_report_counts_as_reaction() -> None:
     watch = EvidenceWatch(known(shows=Shows.UNKNOWN))
     for number in range(UNREACTED - 1):
-        watch.pause(10.0 + 5 * number, 0.0)
+        watch.gap(10.0 + 5 * number, 0.0)
     watch.reports(40.0)
     watch.evidence.on_block(Blocking.WHISTLE, 0.3, 40.1)
     watch.reports(40.0 + INTERVAL_S + 0.304)
-    assert watch.pause(50.0, 0.0) is LOST
+    assert watch.gap(50.0, 0.0) is LOST
     assert watch.learned.shows is Shows.UNKNOWN, "the count began anew"
 
 
@@ -440,19 +440,19 @@ def test_only_blocking_car_shows_left_mode_by_one_report(shows: Shows) -> None:
     """A car that reports by a timer does so in the middle of a block, with the motors on."""
     watch = tracking(10.0, known(shows=shows))
     watch.closed(10.0)
-    assert watch.reports(11.5) == [PAUSE]
+    assert watch.reports(11.5) == [BLOCK_GAP]
 
 
 def test_general_stop_after_mode00_leaves_left_mode_unshown() -> None:
     watch = tracking(10.0)
     watch.closed(10.0)
     watch.evidence.on_other_frame()
-    assert watch.reports(11.5) == [PAUSE]
+    assert watch.reports(11.5) == [BLOCK_GAP]
 
 
 @pytest.mark.parametrize(
     ("late_s", "found"),
-    [(0.01, [PAUSE, SETTLING]), (LATE_S - 0.01, [PAUSE, SETTLING]), (LATE_S + 0.01, [REPORT, PAUSE])],
+    [(0.01, [BLOCK_GAP, SETTLING]), (LATE_S - 0.01, [BLOCK_GAP, SETTLING]), (LATE_S + 0.01, [REPORT, BLOCK_GAP])],
 )
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.COLOR_LED], ids=str)
 def test_single_report_on_slow_link_counts_as_pause(mode: Mode, late_s: float, found: list[Finding]) -> None:
@@ -562,7 +562,7 @@ def fan() -> Pair:
 ROWS = [
     (cases.LEFT_SHAPE, lambda: in_mode(Mode.TRACKING), "out of the mode that it reported"),
     (cases.LEFT_SILENT, lambda: in_mode(Mode.REMOTE_CONTROL), "out of remote_control"),
-    (cases.MANUAL, driven, "2 pauses in its reports"),
+    (cases.MANUAL, driven, "2 gaps in its reports"),
     (cases.NO_ECHO, lambda: driven(world=World.open_field()), "no sonar echo"),
     (cases.FAN, fan, "while its fan runs"),
     (cases.RASPBERRY_PI, lambda: driven("raspberry_pi"), "a Raspberry Pi car never confirms a stop"),
