@@ -163,7 +163,7 @@ def _add_run(commands: "argparse._SubParsersAction[Any]") -> None:
     run.add_argument(
         "--people-only",
         action="store_true",
-        help="let only the people of --person drive this car; without --person, nobody",
+        help="let only the people of --person drive this car. Without --person, nobody may",
     )
     run.add_argument(
         "--longest-drive",

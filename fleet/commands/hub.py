@@ -36,10 +36,10 @@ DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
 MAX_JOIN_LINE: Final = 500
 """Maximum characters of the line that `fleet join -` reads."""
 HUB_RESTART_S: Final = 2.0
-"""Time within which gateways are back after new rules: the hub looks for them every 0.5 s, gateways retry every 0.5
-s."""
+"""Time within which gateways are connected again after new rules. The hub looks for new rules every 0.5 s, and gateways
+try to connect every 0.5 s."""
 SITE_RULES_S: Final = 5.0
-"""The same at another site. Its hub asks for the rules every two seconds."""
+"""The same time at another site, whose hub asks the main hub for new rules every two seconds."""
 
 
 @click.group(
@@ -159,7 +159,7 @@ def invite(
         if car and invited in store.known:
             _stop_first(endpoint, car)
         with cli_errors(), _disk_errors():
-            store.reserve(invited)  # this ends an earlier certificate, so do it only when this computer listens
+            store.reserve(invited)  # last, when this computer listens, because this ends an earlier certificate
         if port != JOIN_PORT:
             here = f"{here}:{port}"
         if as_json:
@@ -245,7 +245,7 @@ examples:
     "--at",
     "site",
     metavar="HOST[:PORT]",
-    help="Use the hub of a site at this address. On that hub's own computer: 127.0.0.1.",
+    help="Use the hub of a site, which has this address: 127.0.0.1 on the computer of that hub.",
 )
 def join_hub(words: tuple[str, ...], site: str | None) -> None:
     """Join the hub on another computer, with the code that `fleet hub invite` shows there.
@@ -271,8 +271,8 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
         if joined.rules:
             click.echo(
                 f"This computer is the hub of {joined.identity} now, linked to {name}. `fleet up` starts it. Invite "
-                f"its users on {name}, and let them join with --at: on this computer, `fleet join {name} CODE --at "
-                "127.0.0.1`."
+                f"its users on {name}, and let them join with --at. On this computer, that is `fleet join {name} CODE "
+                "--at 127.0.0.1`."
             )
             return
         said = _describe_cars_on(endpoint, SITE_RULES_S if site else HUB_RESTART_S)
@@ -292,8 +292,8 @@ def leave() -> None:
     with cli_errors(), _disk_errors():
         if cars := running_cars(resolve_endpoint()):
             raise click.ClickException(
-                f"gateways run here ({', '.join(cars)}), which would lose their certificate while their cars may move: "
-                "end them first (`fleet down`, Ctrl-C, or `systemctl stop`)"
+                f"gateways run here ({', '.join(cars)}). They would lose their certificate while their cars may move. "
+                "End them first (`fleet down`, Ctrl-C, or `systemctl stop`)"
             )
         endpoint, kept = local_hub.leave()
     if not endpoint:

@@ -28,8 +28,8 @@ PARENT_CHECK_INTERVAL_S: Final = 0.1
 RATES: Final = (0.01, 100.0)
 
 EPILOG: Final = """\
-The command prints one JSON line per car: {"car", "platform", "link"}. Give the link to `gateway run --link`. A plain
-pty has another name after each link_drop, so the line is printed again. The link pty:PATH has the same name again.
+The command prints one JSON line per car: {"car", "platform", "link"}. Give the link to `gateway run --link`. After each
+link_drop, a plain pty has another name, so the line is printed again. With pty:PATH the name stays the same.
 
 options of a platform that real cars have, too; join several with + (--car red:arduino+arm+interval=0.71:pty):
   +arm +imu                             the car has an arm; the car has a gyroscope
@@ -83,7 +83,7 @@ A world from a file can have lamps that light sensors see, things to bump into a
 other and block each other's way. `fleet example copy follow` writes such a file with a comment for each field. On
 stdin:
   {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (for a lamp on a car: ahead, left)
-  {"thing": "cart", "x_m": 1, "y_m": 0} puts it there, off its path; or "speed_m_s" for its speed along its path
+  {"thing": "cart", "x_m": 1, "y_m": 0} takes it off its path, to there; or "speed_m_s": its speed along its path
 The true state, on stdin:
   {"car": "red", "ask": "truth"}        mode, motors, pose, ...; for a replay: bytes sent and ignored, rounds
   {"ask": "world"}                      every lamp and thing: where it is, whether it is on, its size and speed
@@ -120,12 +120,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="WORLD",
         default="room",
         help="room has walls and a line to track. open has nothing, so no ranging has an echo. Or give a file with "
-        "lamps, things and cars that meet, such as `fleet example show follow` prints (default: room)",
+        "lamps, things, and cars that can bump into each other, such as `fleet example show follow` prints (default: "
+        "room)",
     )
     parser.add_argument(
         "--check",
         action="store_true",
-        help="only check the world and end: for the cars of --car if there are any, otherwise for any cars",
+        help="only check the world, and end. With --car, the world may name only these cars, otherwise any",
     )
     parser.add_argument(
         "--fault",
