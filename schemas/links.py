@@ -1,6 +1,7 @@
 """Link URLs: each kind of link is a class, with its text, its port, its check and its help. Nothing is opened.
 
-A kind of link is a class here and a row in `KINDS`. The module of `gateway.link` with the name of its scheme opens it.
+A kind of link is a class here and a row in `KINDS`. Its scheme is also the name of the module in `gateway.link`
+that opens such links.
 """
 
 import ipaddress
@@ -33,7 +34,7 @@ _BLE_NAME_BYTES: Final = 248
 """Maximum length of the name of a Bluetooth device."""
 
 PortKey = tuple[str, str, frozenset[tuple[str, str]]]
-"""Equal for two links to one port: the kind of link, the device or host behind all its names, and the ids."""
+"""Equal for two links that open the same port: the kind of link, the device or host in one normal form, and the ids."""
 
 
 class BadLink(ValueError):
@@ -50,7 +51,7 @@ class Look(Protocol):
         """Look for a USB device."""
 
     def host(self, host: str, port: int) -> tuple[bool, str]:
-        """Look for a host, without a connection to a port where that could harm a car."""
+        """Look for a host. Do not connect to a port where that could harm a car."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,14 +60,15 @@ class LinkUrl(ABC):
 
     scheme: ClassVar[str]
     forms: ClassVar[tuple[str, ...]]
-    """How it is written, for the help."""
+    """How its URL is written, for the help."""
     options: ClassVar[str] = ""
     """What may follow its URL, for the help."""
     module: ClassVar[str] = ""
-    """The Python module that it needs, if the basic installation lacks it. The extra `extra` installs it, and `needs`
-    is its name for people."""
+    """The Python module that this kind of link needs and the basic installation lacks. Empty if none."""
     extra: ClassVar[str] = ""
+    """The extra of our package that installs this module."""
     needs: ClassVar[str] = ""
+    """The name of what the module brings, for people."""
     harm: ClassVar[str] = ""
     """The harm that opening and closing it may do to a car, in words. Empty if none."""
     same_car: ClassVar[Mapping[str, Any]] = {}
@@ -99,7 +101,7 @@ class LinkUrl(ABC):
         yield self.port_key
 
     def check(self, look: Look) -> tuple[bool, str]:  # noqa: ARG002 - Bluetooth cannot be looked at
-        """Return True if a car may be there, and a text. Open nothing that could move or reset a car, or end it."""
+        """Return True if a car may be there, and a text. Do not open what could move or reset a car."""
         if missing := self.missing():
             return False, missing
         return True, f"{self.needs} is installed; `fleet scan` shows whether the car is near"
@@ -140,7 +142,7 @@ class SerialUrl(_SerialLine):
 
     @classmethod
     def guess(cls, text: str) -> str:
-        """Return the URL that such a text means."""
+        """Return the URL that a text without a scheme probably means. Empty if none."""
         return f"/dev/{text}" if re.fullmatch(r"(tty|cu\.|rfcomm)[\w.-]*", text) else ""
 
     @property
@@ -172,7 +174,7 @@ class UsbUrl(_SerialLine):
     forms = ("serial://?vid=1a86&serial=ABC",)
 
     def fits(self, vid: int | None, pid: int | None, serial: str | None) -> bool:
-        """Return True if a device with these ids may be the one."""
+        """Return True if this link may mean a device with these ids."""
         return self.vid in (None, vid) and self.pid in (None, pid) and self.serial in (None, serial)
 
     @property
@@ -230,7 +232,7 @@ class TcpUrl(LinkUrl):
 
     @classmethod
     def guess(cls, text: str) -> str:
-        """Return the URL that such a text means."""
+        """Return the URL that a text without a scheme probably means. Empty if none."""
         host = re.fullmatch(r"((?:\d{1,3}\.){3}\d{1,3}|\w[\w.-]*(?=:))(:\d{1,5})?", text)
         return f"tcp://{host[1]}{host[2] or f':{CAR_TCP_PORT}'}" if host else ""
 
@@ -276,7 +278,7 @@ class BleUrl(LinkUrl):
 
     @classmethod
     def guess(cls, text: str) -> str:
-        """Return the URL that such a text means."""
+        """Return the URL that a text without a scheme probably means. Empty if none."""
         return f"ble://{text.upper()}" if _BLE_ADDRESS.fullmatch(text.upper()) else ""
 
     @property

@@ -288,9 +288,9 @@ class Shows(StrEnum):
 
     UNKNOWN = "not_known_yet"
     YES = "yes"
-    """It has shown one."""
+    """The car has shown one."""
     NO = "no"
-    """Its reports do not react to frames."""
+    """The reports of the car do not react to frames."""
 
 
 class Blocking(StrEnum):

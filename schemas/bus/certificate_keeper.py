@@ -18,7 +18,7 @@ CHECK_INTERVAL: Final = timedelta(minutes=10)
 """Interval at which a program looks at its certificate, and at which it repeats a failed renewal."""
 SHORTEST_CHECK_INTERVAL: Final = timedelta(seconds=1)
 SHARE_OF_A_CHECK: Final = 0.1
-"""The same interval as a share of the time that the certificate has left. The shorter of the two counts."""
+"""CHECK_INTERVAL as a share of the time that the certificate has left. The shorter of the two intervals counts."""
 WARNED_SHARE: Final = 0.1
 """Share of a certificate's life that is left when a program warns that nobody has renewed it."""
 RENEWAL_QUERY_TIMEOUT_S: Final = 10.0

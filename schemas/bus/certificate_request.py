@@ -1,6 +1,6 @@
 """Asks the hub for the next certificate of an identity. The key stays the same, and never leaves this computer.
 
-The library of cryptography takes a while to load, so programs import this module when a certificate is due.
+The library of cryptography takes a while to load, so programs import this module only when a certificate is due.
 """
 
 import json
@@ -23,7 +23,10 @@ REQUEST: Final = "request"
 
 
 def identity_in(path: Path) -> str:
-    """Return the identity of a certificate, without the number of a later invitation. Raises OSError, ValueError."""
+    """Return the identity in a certificate, such as car.red. Raises OSError, ValueError.
+
+    A later invitation of the same identity adds a number to the name in the certificate. It is not part of the result.
+    """
     name = x509.load_pem_x509_certificate(path.read_bytes()).subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0]
     return ".".join(str(name.value).split(".")[:2])
 
@@ -31,8 +34,8 @@ def identity_in(path: Path) -> str:
 def renew(credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[bytes], bytes]) -> str:
     """Fetch and store the next certificate of an identity. Return why that failed, or an empty text if it is stored.
 
-    file: name of the certificate's file. `ask` sends a request to the hub, and returns the answer; empty if there is
-    none.
+    file: name of the files of the certificate and its key, without their ending. `ask` sends a request to the hub, and
+    returns the answer, or nothing if there is none.
     """
     path = credentials.directory / f"{file}.pem"
     try:

@@ -253,8 +253,8 @@ class Document:
         for each in error.errors(include_url=False):
             where, on_key = self._place_of(each["loc"], missing=each["type"] == "missing")
             errors.append((where, on_key or each["type"] == "extra_forbidden", each))
-        # A value of a union gets errors from each member. That it has the wrong type for one member is noise if another
-        # member accepts the type, and reports a fault inside the value or another fault of the value.
+        # A value of a union gets errors from each member. "Wrong type" from one member is noise if another member
+        # accepts the type, and reports a fault inside the value or another fault of the value.
         accepted = {where[:depth] for where, _, _ in errors for depth in range(len(where))}
         accepted |= {where for where, _, each in errors if not each["type"].endswith("_type")}
         return [each for each in errors if each[0] not in accepted or not each[2]["type"].endswith("_type")]
