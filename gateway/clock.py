@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-# A wall clock that is slewed may gain 0.5 ms per second, and the offset follows it in steps of this size.
+# NTP may slew a wall clock by 0.5 ms per second. The offset follows such a clock in steps of this size.
 MIN_STEP_NS: Final = 2_000_000
 """Minimum change of the offset between the clocks that is applied."""
 # Three readings of the clocks take less than this, unless the scheduler interrupts the process.

@@ -59,7 +59,7 @@ class SafetyStateFile:
         try:
             content = json.loads(text)
             state, others = _parse(content, now_ns), tuple(_parse_others(content, now_ns))
-            # Files of older versions name no link, because there was only one car of a name.
+            # In older versions there was only one car of a name, so their files name no link.
             link = _text(content.get("link", self._link))
         except DAMAGE:
             return self._unreadable("", now_ns)
@@ -92,7 +92,7 @@ class SafetyStateFile:
 def _exchanged(
     others: tuple[_OfLink, ...], state: PersistedSafety, *, was: str, now: str
 ) -> tuple[tuple[_OfLink, ...], PersistedSafety]:
-    """Return the other links and the state after the car's link has changed."""
+    """Put the state of the previous link (`was`) among the others, and take out that of the new one (`now`)."""
     of_car = tuple(each for each in state.estops if not each.fleet_wide)
     of_fleet = tuple(each for each in state.estops if each.fleet_wide)
     mine = next((each for each in others if each.link == now), _OfLink(now, None, (), None))

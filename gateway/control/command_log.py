@@ -41,7 +41,7 @@ class Pending:
 
     @property
     def is_delayed(self) -> bool:
-        """Return True if there is a delay before its next frame. Other commands need not wait for such a command."""
+        """Return True if there is a delay before its next frame. Other commands need not wait for this one."""
         return bool(self.frames) and isinstance(self.frames[0], Later)
 
     @property

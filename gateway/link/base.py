@@ -55,7 +55,7 @@ class Device(ABC):
     @property
     @abstractmethod
     def heading(self) -> tuple[str, str]:
-        """Its address, and a text with the other known facts."""
+        """The address of the device, and a text with the other known facts."""
 
     @property
     @abstractmethod

@@ -39,7 +39,7 @@ class BleDevice(Device):
 
     @property
     def heading(self) -> tuple[str, str]:
-        """Its address, name and signal strength."""
+        """The address, and a text with the name and the signal strength."""
         return self.address, f"{printable(self.name) or 'no name'}, {self.rssi} dBm"
 
     @property

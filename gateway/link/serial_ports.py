@@ -29,12 +29,12 @@ class SerialPort:
 
 
 def serial_ports() -> list[SerialPort]:
-    """Return the serial ports of this computer by name. Raises CannotOpen if the system does not list them."""
+    """Return the serial ports of this computer, sorted by name. Raises CannotOpen if the system does not list them."""
     return described(list_ports(), by_id(BY_ID))
 
 
 def by_id(directory: Path) -> dict[str, str]:
-    """Return the names that stay the same after a replug, by device (Linux)."""
+    """Map each device to its name that stays the same after a replug (Linux)."""
     try:
         return {str(name.resolve()): str(name) for name in sorted(directory.iterdir())}
     except OSError:
@@ -48,7 +48,8 @@ def described(found: "Iterable[ListPortInfo]", lasting: Mapping[str, str]) -> li
     result = []
     for port in ports:
         url: LinkUrl = SerialUrl(lasting.get(port.device, port.device))
-        # Some makers give every device one serial number, and some devices are several ports.
+        # Some makers give the same serial number to all their devices, and some devices have several ports. So use the
+        # number only if one port has it.
         if port.vid is not None and port.serial_number and same[port.vid, port.serial_number] == 1:
             url = UsbUrl(vid=port.vid, serial=port.serial_number)
         result.append(

@@ -22,7 +22,7 @@ SAID_WITHIN_S: Final = 3.0
 """Time within which a bridge that already has a client sends a text about that, and closes the connection. Bytes of a
 connection that lasts longer are those of a car."""
 MAX_SAID_BYTES: Final = 120
-"""Maximum bytes of such a text that an error message quotes."""
+"""Maximum bytes of the text of a bridge that an error message quotes."""
 
 _Addresses = list[tuple[int, Any]]
 """(family, socket address), as from getaddrinfo."""

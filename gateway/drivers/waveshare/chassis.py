@@ -20,7 +20,7 @@ class Chassis:
     """One chassis with one firmware."""
 
     main: int
-    """Its number in the command `T:900`, which sets wheels, direction and the kind of speed control."""
+    """The number of the chassis in the command `T:900`, which sets wheels, direction and the kind of speed control."""
     has_encoders: bool
     """True if the car controls its speed with encoders: commands are in m/s, and its `L` and `R` are measured. False if
     a command is a share of full power (0.5 is full), and its `L` and `R` are nothing or repeat the command."""

@@ -92,7 +92,7 @@ TURNS_M_S: Final = 0.02
 UNASKED_REPORTS: Final = 3
 """Number of feedbacks in a row with turning wheels that count as a motion which nobody here commanded."""
 UNASKED_LOG_S: Final = 30.0
-"""Minimum time between two log records about such a motion. The car is also stopped in between."""
+"""Minimum time between two log records about a motion that nobody commanded. The car is also stopped in between."""
 ON_ITS_WAY_S: Final = 2.0
 """Maximum time that a line of ours takes to reach the car over a slow link."""
 STUCK_S: Final = 1.0

@@ -1,4 +1,4 @@
-"""Turns one line of such a car into events. Pure. Any bytes are allowed.
+"""Turns one line of a Waveshare car into events. Pure. Any bytes are allowed.
 
 The firmwares mix JSON with text, and print some JSON without a line end. So a line may contain text, several objects,
 and the beginning of a line that the link has truncated. Each of these becomes an event.

@@ -215,7 +215,7 @@ class CarModel:
 
     @property
     def is_without_echo(self) -> bool:
-        """Return True if the last ranging had no echo. A car that has sent no range is not known to have none."""
+        """Return True if the last ranging had no echo. Return False if the car has sent no range yet."""
         return self.range_cm is None and self.range_at > float("-inf")
 
     def moved_since(self, range_cm: float | None, since: float) -> str:

@@ -138,7 +138,7 @@ class CarMonitor:
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 
     def _on_changed_expectation(self, now: float) -> None:
-        """Log that this car cannot show its stops, or that its rhythm is that of another program. Handle the latter."""
+        """Log that this car cannot show its stops, or that it runs another program. Handle the second case."""
         name, learned = self.model.name, self.model.learned
         if learned.shows is Shows.NO:
             words = cases.NO_REACTION.why(name)

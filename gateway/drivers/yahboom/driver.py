@@ -229,5 +229,5 @@ def _as_wire_event(event: Event) -> WireEvent:
 
 
 def yahboom(profile: Profile, *, auto: bool = False, learned: Learned | None = None) -> Callable[[Desk], YahboomDriver]:
-    """Return a function that makes the driver of such a car, for `Controller`."""
+    """Return a function that makes the driver of a Yahboom car, for `Controller`."""
     return lambda desk: YahboomDriver(desk, profile, auto=auto, learned=learned)

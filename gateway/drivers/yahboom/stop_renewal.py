@@ -1,4 +1,4 @@
-"""Repeats the stop of a car at rest that has not shown it, because its frames may have been lost. Pure."""
+"""Repeats the stop of a car that counts as stopped but has not shown it: its frames may have been lost. Pure."""
 
 from typing import Final
 
@@ -12,7 +12,7 @@ from gateway.drivers.yahboom.stops.stop_in_progress import HELD_UP_S
 RENEWAL_INTERVALS_S: Final = (2.2, 4.0, 6.0)
 """Intervals between renewals. The last one repeats."""
 CLEARING_RENEWALS: Final = 4
-"""Maximum renewals by `MODE00` after one stop. `MODE00` beeps, so there are no more."""
+"""Maximum renewals by `MODE00` after one stop. `MODE00` clears half a frame from the car's buffer, but also beeps."""
 
 
 class StopRenewal:
@@ -53,13 +53,13 @@ class StopRenewal:
         """Return when the next frame of a renewal is due; inf if never."""
         if self._general_stop_follows:
             return self._model.pacing.written_at + REPEAT_INTERVAL_S
-        # If the car read `MODE00` in one string with a servo frame before it, it would take the digits of the servo
-        # frame, and open a mode.
+        # `MODE00` must not reach the car together with a servo frame before it. The car would read both as one string,
+        # take the digits of the servo frame for those of the mode, and open a mode.
         return max(self._next_at, self._model.pacing.ready_at(Gate.ALONE)) if self._clears else self._next_at
 
     @property
     def goes_first_at(self) -> float:
-        """Return when the next frame of a renewal goes before a stream of actions; inf if never."""
+        """Return from when on a stream of actions must let the next frame of a renewal go first; inf if never."""
         follows_at = self._cleared_at + REPEAT_INTERVAL_S
         return (follows_at if self._general_stop_follows else self._next_at) + HELD_UP_S
 
@@ -87,5 +87,5 @@ class StopRenewal:
         """
         model = self._model
         if model.profile.refusal(ModeClose()) is not None:
-            return False  # some programs end at a named frame
+            return False  # the programs of some cars end with an error at a named frame
         return model.rest_case.clears and self._count <= CLEARING_RENEWALS

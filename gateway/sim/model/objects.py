@@ -71,7 +71,7 @@ class MovingObject:
     waits_for_m: float = 0.0
     """The thing moves only while a car is within this distance of its middle. If 0, it always moves."""
     from_m: float = 0.0
-    """Its position along its path at the time `since_s`."""
+    """How far along its path the thing was at the time `since_s`."""
     since_s: float = 0.0
     going: bool = True
     """False while the thing waits."""

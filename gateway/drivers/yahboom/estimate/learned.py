@@ -54,7 +54,7 @@ became the rhythm, as the first interval does, each stop would wait that long fo
 
 
 def blocking_kind(frame: Frame) -> Blocking | None:
-    """Return the kind of a frame that may block. None for a frame that does not, or blocks in several ways."""
+    """Return the kind of a frame that may block. None if the frame never blocks, or blocks in several ways."""
     match frame:
         case ModeClose():
             return Blocking.MODE_CLOSE

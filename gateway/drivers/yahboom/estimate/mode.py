@@ -20,10 +20,10 @@ CONTRADICTING_FRAMES: Final = 3
 (docs/explanation/how-sure-is-a-mode.md#contradiction)."""
 MANUAL_SILENCE_S: Final = 3.0
 RUNNING_SILENCE_S: Final = 1.0
-"""Minimum silence that contradicts mode 0, and that contradicts modes 2, 5 and 6. The time of known blocks, and of a
-running fan, is not counted."""
+"""Minimum silence that contradicts mode 0 (the first), or modes 2, 5 and 6 (the second). The time of known blocks, and
+of a running fan, is not counted."""
 FIRST_SILENCE_S: Final = 5.0
-"""The same for mode 0 until the rhythm of the car is known."""
+"""Minimum silence that contradicts mode 0 while the rhythm of the car is not known yet."""
 SILENCE_MARGIN_S: Final = 0.75
 """How much longer than the car's longest normal interval a silence must be to contradict mode 0."""
 CORRUPTED_MATCH_S: Final = 0.5
@@ -55,7 +55,7 @@ class ModeEstimator:
     _in_mode_by: float = field(default=float("-inf"))
     """The latest time at which a car that obeys is in the commanded mode."""
     _in_same_mode_by: float = field(default=float("-inf"))
-    """The same time for a car that was in that mode already when the last frame was written."""
+    """The latest time at which a car is in the commanded mode if it was in this mode already at the last frame."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
     _other_at: float = field(default=float("-inf"))

@@ -88,7 +88,7 @@ class FrameWords:
         return [word for word in self.words if word not in found]
 
     def are_in_order(self, found: Sequence[bytes]) -> bool:
-        """Return True if these are the words of such a frame, each once and in its place."""
+        """Return True if a frame has exactly these words, each once and in its place."""
         return tuple(found) == self.words
 
 
