@@ -58,12 +58,12 @@ class Entity:
     """One value of a car."""
 
     name: str
-    """Its field in the state, and the last part of its id."""
+    """The field of the value in the state, and the last part of the entity's id."""
     title: str
     value: Callable[[CarState, float], Any]
     """The value at a time. None means that it was not measured, or is stale."""
     config: Mapping[str, Any]
-    """Its settings for Home Assistant. In a template, {0} stands for `name`."""
+    """The entity's settings for Home Assistant. In a template, {0} stands for `name`."""
     of_absent: bool = False
     """True if it has a value even if the car is not available."""
 

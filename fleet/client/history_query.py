@@ -13,6 +13,7 @@ HISTORY_TIMEOUT_S: Final = 10.0
 MAX_HISTORY_QUERIES: Final = 4
 """Maximum number of queries for values that were lost on the way."""
 MAX_HISTORY_S: Final = 7 * 86_400.0
+"""Maximum of `since_s`: a week."""
 
 
 def selector(key_expression: str, *, last: int | None = None, since_s: float | None = None) -> str:
@@ -62,12 +63,14 @@ def gaps(readings: Iterable[Reading]) -> dict[str, int]:
 def describe_shortfalls(
     readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
 ) -> list[str]:
-    """Describe why there are fewer readings than requested, one line for each key and one for all states.
+    """Describe why there are fewer readings than requested: a line for each key, but only one for all keys of states.
 
     readings: sorted as `merge` sorts.
     """
     every, has_states = list(readings), False
-    lines = [f"{key}: {count} in between were lost on the way. Try again." for key, count in gaps(every).items()]
+    lines = [
+        f"{key}: {count} missing between others, lost on the way. Try again." for key, count in gaps(every).items()
+    ]
     for key, group in itertools.groupby(every, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
         if topic is None:
@@ -80,17 +83,20 @@ def describe_shortfalls(
         full = len(found) >= topic.history_size
         if since_s is not None:
             if full and oldest_s < since_s and (last is None or last > topic.history_size):
-                lines.append(f"{key}: goes back {oldest_s:.1f} s of {since_s:g} s, {keeps}")
+                lines.append(f"{key}: goes back only {oldest_s:.1f} s, not {since_s:g} s: {keeps}")
         elif last is not None and len(found) < last:
             more = keeps if full else "its gateway has no more"
-            lines.append(f"{key}: {len(found)} of {last}, {more}")
+            lines.append(f"{key}: {len(found)} of {last}: {more}")
     if has_states and last != 1:
         lines.append("Gateways keep only the latest value of a state. A recording has all (`fleet record`).")
     return lines
 
 
 def describe_missing_history(matched: Iterable[topics.Topic]) -> str:
-    """Describe why these topics have no history. Return an empty string if one of them has one, or without topics."""
+    """Describe why these topics have no history.
+
+    Return an empty string if at least one of them has a history, or if there are no topics.
+    """
     listed = list(matched)
     if not listed or any(topic.history_size for topic in listed):
         return ""

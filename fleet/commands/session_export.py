@@ -27,9 +27,9 @@ def export_tables(session: Session, out: Path, form: str, *, nanoseconds: bool =
     if done.undecoded:
         click.echo(f"{done.undecoded} messages do not fit their schema: they are in `other`, as bytes", err=True)
     for line in done.left_out.words():
-        echo_safely(f"not in the table of its key: {line}", err=True)
+        echo_safely(f"in another table than its key says: {line}", err=True)
     for table, count in done.undated.items():
-        echo_safely(f"{table}: {count} times are beyond what {form} can hold: they are empty", err=True)
+        echo_safely(f"{table}: {form} cannot hold {count} of the times: they are empty", err=True)
     _say_damage(session)
 
 
@@ -59,7 +59,7 @@ def export_foxglove(session: Session, out: Path) -> None:
         (new / "layout.json").write_text(layout_text(done.cars, done.fleet), encoding="utf-8")
     click.echo(f"{out}: {done.messages} messages on {len(done.schemas)} topics, and a layout to import")
     for line in done.strays.words():
-        echo_safely(f"on a topic of its own, stray/KEY/TYPE: {line}", err=True)
+        echo_safely(f"moved to a topic stray/KEY/TYPE: {line}", err=True)
     _say_damage(session)
 
 

@@ -76,7 +76,7 @@ class Entrance:
             self._drop(key)
 
     def _after(self, delay_s: float, call: Callable[[], None]) -> None:
-        """Call once after a delay. If such a call waits already, do nothing."""
+        """Call a function once after a delay. Do nothing if a call of it waits already."""
         if call not in self._timers:
 
             def run() -> None:

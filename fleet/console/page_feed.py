@@ -19,7 +19,7 @@ class PageFeed(ABC):
     @property
     @abstractmethod
     def messages(self) -> Mapping[str, Handler]:
-        """The messages that such a page sends, by their `t`."""
+        """The handlers of the messages that a page of this kind sends, by the `t` of a message."""
 
     def on_page(self, page: PageLink) -> None:  # noqa: ARG002 - a page may begin empty
         """Greet a new page."""

@@ -279,7 +279,8 @@ class HubStore:
             OF_SITES: access_control(sorted(allowed), of_site=True),
         }
         made = json.dumps(settings, indent=1).encode()
-        # Write the rules first. If the disk is full, the list must not show somebody as revoked who is not.
+        # Write the rules first, and then the list. If the disk is full in between, the list must not call somebody
+        # revoked who can still connect.
         if not path.exists() or path.read_bytes() != made:
             write_atomically(path, made, private=True)
         write_atomically(self.directory / IDENTITIES_FILE, json.dumps(stored, indent=1).encode(), private=True)

@@ -232,7 +232,7 @@ class _Others:
     kinds: tuple[str, ...]
     """Why each of these cars does not have the role."""
     words: str
-    """The same with the cars' names, truncated if there are many."""
+    """These reasons with the names of the cars, truncated if there are many cars."""
     changes: str
     """The change that would let each of them have the role, with the cars' names, truncated likewise."""
     used: tuple[str, ...]

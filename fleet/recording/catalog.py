@@ -288,7 +288,7 @@ class _Cast:
     topic: str
     column: str
     kind: str
-    """Its type in our tables."""
+    """The type of the column in our tables."""
     files: tuple[str, ...]
 
     def count(self) -> str:

@@ -17,7 +17,7 @@ MAX_CARS_LISTED: Final = 8
 READY_TIMEOUT_S: Final = 30.0
 """Time without another ready car after which a start ends, although somebody is missing."""
 LINK_OPEN_TIMEOUT_S: Final = 10.0
-"""The same time, if everything runs and only the links of cars cannot be opened."""
+"""The time that replaces READY_TIMEOUT_S if everything runs and only the links of cars cannot be opened."""
 REACHED_S: Final = 2.0
 """Time for which a link must be open to count as a link to a car, if the car sends nothing."""
 RATE_WINDOW_S: Final = 2.0

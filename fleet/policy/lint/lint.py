@@ -27,9 +27,9 @@ class Severity(StrEnum):
     """The severity of a fault."""
 
     ERROR = "error"
-    """It can never work."""
+    """This part of the plan can never work."""
     WARNING = "warning"
-    """It works, but probably not as intended."""
+    """This part of the plan works, but probably not as intended."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,7 +130,7 @@ class Plan:
     rules: tuple[Rule, ...]
     phases: Mapping[str, PlanPhase]
     idle: Mode | None
-    """The mode of a car without a role, or None if such a car is left alone."""
+    """The mode of cars that have no role. None if the plan leaves them alone."""
     text: str
     places: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
     """Line and column of each role, rule, phase and named car in the text, by the name that findings use."""

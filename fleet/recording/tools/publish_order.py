@@ -31,9 +31,9 @@ class RecordedMessage(Generic[Item]):
     log_ns: int
     """When it was received."""
     at_ns: int
-    """Its stamp."""
+    """The stamp in the message."""
     stream: tuple[str, str]
-    """Its key, and the boot id of the publisher that numbered it."""
+    """The key of the message, and the boot id of the publisher that numbered it."""
     number: int
     item: Item
 

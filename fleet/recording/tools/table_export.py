@@ -23,7 +23,7 @@ BATCH_BYTES: Final = 4 << 20
 ROW_BYTES: Final = 256
 OTHER_TABLE: Final = "other"
 STRAY_PREFIX: Final = "stray."
-"""Prefix of tables with messages whose type is not the type of their key."""
+"""Prefix of tables with stray messages: each has another type than its key calls for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Exported:
     undecoded: int
     """Messages that do not match their protobuf schema. Their bytes are in the table of other messages."""
     left_out: LeftOut = field(default_factory=LeftOut)
-    """Messages that are not in the table of the type of their key, but in another."""
+    """Messages whose key calls for one table, but which are in another."""
     undated: Mapping[str, int] = field(default_factory=dict)
     """Times that the format cannot hold, by name of the table. They are null there."""
 
@@ -56,24 +56,24 @@ class _Batch:
     def part(self, numbers: Sequence[int]) -> "_Batch":
         """Return the messages with these row numbers."""
         columns = (self.infos, self.log_ns, self.publish_ns, self.sequences, self.payloads)
-        return _Batch(*([column[number] for number in numbers] for column in columns))  # type: ignore[arg-type]  # in turn
+        return _Batch(*([column[number] for number in numbers] for column in columns))  # type: ignore[arg-type]  # lists in the order of the fields
 
-    def extend(self, others: "_Batch") -> None:
+    def extend(self, more: "_Batch") -> None:
         """Add all messages of another batch."""
-        self.infos += others.infos
-        self.log_ns += others.log_ns
-        self.publish_ns += others.publish_ns
-        self.sequences += others.sequences
-        self.payloads += others.payloads
+        self.infos += more.infos
+        self.log_ns += more.log_ns
+        self.publish_ns += more.publish_ns
+        self.sequences += more.sequences
+        self.payloads += more.payloads
 
     def common(self) -> list[tables.Values]:
         """Return the values of the columns that every table has."""
-        topics = [info.channel.topic for info in self.infos]
-        cars = {key: tables.car_of(key) for key in set(topics)}
-        return [topics, [cars[key] for key in topics], self.log_ns, self.publish_ns, self.sequences]
+        key_column = [info.channel.topic for info in self.infos]
+        cars = {key: tables.car_of(key) for key in set(key_column)}
+        return [key_column, [cars[key] for key in key_column], self.log_ns, self.publish_ns, self.sequences]
 
-    def others(self) -> list[tables.Values]:
-        """Return the values of the columns for messages that are not protobuf."""
+    def undecoded(self) -> list[tables.Values]:
+        """Return the values of the columns of the table of other messages, which are not decoded."""
         texts = [_text(payload) for payload in self.payloads]
         return [
             [message_of(info) or None for info in self.infos],
@@ -107,7 +107,7 @@ class _Table:
             except DecodeError:
                 batch, bad, messages = _split_undecodable(batch, self.message_class)
         if batch.infos:
-            own = self.layout.fill(messages) if self.layout is not None else batch.others()
+            own = self.layout.fill(messages) if self.layout is not None else batch.undecoded()
             self.sink.add([*batch.common(), *own])
             self.rows += len(batch.infos)
         return bad
@@ -186,7 +186,7 @@ class _Export:
         return self.tables[message_class, stray]
 
     def _open_table(self, message_class: type[Message] | None, *, stray: bool) -> _Table:
-        """Open a new table. Number it if fields of the type changed within the session."""
+        """Open a new table. Number its name if a table has it already: fields of the type changed in the session."""
         stem = message_class.DESCRIPTOR.full_name if message_class is not None else OTHER_TABLE
         stem = f"{STRAY_PREFIX}{stem}" if stray else stem
         taken = {table.name.lower() for table in self.tables.values()}
@@ -245,13 +245,13 @@ def _export(rows: Iterable[Row], open_sink: Callable[[str, Sequence[tables.Colum
     except BaseException:
         writing.discard()
         raise
-    tables = writing.tables.values()
-    undated = {table.name: table.sink.undated for table in tables if table.sink.undated}
-    return Exported({table.name: table.rows for table in tables}, writing.undecoded, writing.left_out, undated)
+    written = writing.tables.values()
+    undated = {table.name: table.sink.undated for table in written if table.sink.undated}
+    return Exported({table.name: table.rows for table in written}, writing.undecoded, writing.left_out, undated)
 
 
 def numbered(name: str, joint: str) -> Iterator[str]:
-    """Yield a name, then the name with a number from 2 on, for the first one that is free."""
+    """Yield a name, then the same name with 2, 3 and so on. The caller takes the first one that is free."""
     yield name
     yield from (f"{name}{joint}{number}" for number in itertools.count(2))
 
