@@ -193,7 +193,7 @@ def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: b
     """
     directory = _log_directory(connect, keys.check_name(fleet, "fleet name"))
     candidates = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]
-    # A name with a `/` could be that of a file elsewhere.
+    # Only files of this directory: a name with a `/` could lead to another one.
     path = next((each for each in candidates if each.parent == directory and _has_log(each)), None)
     if path is None:
         there = _names_of_logs(directory)
@@ -231,7 +231,7 @@ def _last_run(connect: str | None, fleet: str) -> Path:
 
 
 def _has_log(path: Path) -> bool:
-    """Return True if the log exists, or the older file to which a rollover has renamed it."""
+    """Return True if there is a log of this name. Directly after a rollover there is only the older file, `.log.1`."""
     return path.exists() or path.with_suffix(".log.1").exists()
 
 
@@ -270,5 +270,5 @@ def _is_rolled_over(path: Path, file: IO[str]) -> bool:
     try:
         now = path.stat()
     except FileNotFoundError:
-        return False  # it was renamed, and the next line creates the new file
+        return False  # the log was renamed, and its process creates the new file when it logs the next line
     return (there.st_dev, there.st_ino) != (now.st_dev, now.st_ino)

@@ -10,7 +10,7 @@ LEFT_ALONE: Final = "left alone"
 
 
 class DecisionKind(StrEnum):
-    """Kind of a decision: its subject, and for a car what decides."""
+    """Kind of a decision. About a car it says what decides; otherwise whether it is about a role or the phase."""
 
     ROLE = "role"
     RULE = "rule"
@@ -45,7 +45,10 @@ class Decision:
     """Time at which the cause became the current one, s on the step's clock."""
 
     def after(self, before: "Decision | None", now: float) -> "Decision":
-        """Return `before` if both say the same, so that its readings stay. Otherwise return this decision."""
+        """Return the decision that is in force after the one of the last step, `before`.
+
+        It is `before` itself if this decision says the same, so that the readings stay. Otherwise it is this decision.
+        """
         if before is None or before.cause != self.cause:
             return replace(self, since=now)
         if (before.decided, before.why, before.would_change) == (self.decided, self.why, self.would_change):

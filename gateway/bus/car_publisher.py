@@ -29,11 +29,11 @@ VERSION: Final = "0.1.0"
 STATE_INTERVAL_S: Final = 1.0
 """Maximum interval between two messages of a state. A change is published at once (docs/reference/keys.md#topics)."""
 ANSWERS_PER_SLICE: Final = 50
-"""Maximum answers to a query without a pause. As JSON, they take 3 ms."""
+"""Number of answers to a query after which the loop serves the car. As JSON, they take 3 ms."""
 CLIENTS_BACK_S: Final = 1.0
 """Time after a loss of the bus until the other clients, such as the recorder, are connected again."""
 BUS_LOSS_GAP_S: Final = 1.0
-"""Minimum gap of the loop after which the link to the bus may have been lost unnoticed (Zenoh's lease is 2 s)."""
+"""During a gap of the loop of at least this length, the bus may have been lost unnoticed (Zenoh's lease is 2 s)."""
 MAX_PENDING_RECORDS: Final = 1000
 """Maximum records of commands and events that wait for the bus. The oldest are dropped and counted."""
 RAW_PER_S: Final = 100.0

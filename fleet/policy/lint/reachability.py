@@ -42,7 +42,7 @@ def can_be_true(expression: Expression, profile: CarProfile, mode: Mode) -> bool
 
 
 def _assume(node: Node, names: frozenset[str], *, value: bool) -> Node:
-    """Copy a tree with each part that uses one of these names replaced by the literal that favors this value."""
+    """Copy a tree. A part that uses one of these names becomes the literal that pulls the result towards this value."""
     match node:
         case Not(inner):
             return Not(_assume(inner, names, value=not value))
@@ -85,7 +85,8 @@ class ModeReachability:
         """Indexes of the rules that can fire."""
         self._place_cache: dict[tuple[str, ...], bool] = {}
         self._role_cache: dict[tuple[str, str], list[Role]] = {}
-        # A rule cannot trigger itself. So rules are added in rounds: a rule needs only rules from earlier rounds.
+        # A rule cannot trigger itself. So find the rules in rounds: the first can fire without any other rule, the next
+        # because of rules that were found before.
         while more := self._list_more_firing():
             self._firing |= more
             self._place_cache, self._role_cache = {}, {}
@@ -118,9 +119,9 @@ class ModeReachability:
         return f"it needs {role.needs}, and never measures {_first_missing(role.needs, self.profiles(car), Mode)}"
 
     def explain_blindness(self, role: Role) -> str:
-        """Return the reason why no car can measure the needs of this role before it has the role.
+        """Return why no car can meet the needs of this role before it has the role: it does not measure them.
 
-        The text is empty if a car can.
+        The text is empty if some car can.
         """
         needs = role.needs
         if needs is None:
@@ -209,9 +210,9 @@ class ModeReachability:
         return self.cars if self._plan.is_open else [car for car in self._plan.named_cars if car in self.cars]
 
     def _find_modes(self, car: str, phase: str, condition: PlanCondition) -> dict[Mode, str]:
-        """Return the modes that the plan can bring a watched car into, each with the only case in which it does so.
+        """Return the modes that the plan can bring a watched car into.
 
-        The text is empty if no single case is known.
+        If it does so in only one case, the mode has a text about this case. Otherwise its text is empty.
         """
         roles, role = self._list_roles(car, phase), condition.role
         result = {each.mode: "" for each in roles if role in (None, each.name)}
@@ -268,7 +269,7 @@ class ModeReachability:
         when = rule.when
         match effect.who:
             case who if who == THIS_CAR:
-                # A car that triggered the rule in another role may have this role by now, if `until` ends the rule.
+                # A rule with `until` lasts. So a car that triggered it in another role may have this role by now.
                 own_role = role is None or rule.until is not None or when.role in (None, role)
                 triggers = when.role is None or rule.until is not None or any(each.name == when.role for each in roles)
                 return when.car in (None, car) and own_role and triggers

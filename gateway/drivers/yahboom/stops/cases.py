@@ -1,8 +1,8 @@
 """The cases of a stop: what shows it, when it ends without being shown, and what is sent after it. Pure.
 
-A stop has a case from its beginning, for the event that the car does not show it. The case decides whether the stop may
-end as `sent`, and as which case it ends then. That second case decides how the stop is repeated. A new case is a row
-here.
+Each stop begins with a case. If the car does not show the stop, this case decides whether the stop may end as `sent`,
+and with which case it ends: the same, or another one. The case at the end decides how the stop is repeated. To add a
+case, add a row here.
 
 docs/reference/stop-evidence.md has `CASES` as a table.
 """
@@ -64,7 +64,7 @@ class StopCase:
     words: str = ""
     """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
     rule: Callable[["StopCase", StopFacts], "StopCase | None"] = _never
-    """The rule of `ends`, with this case as its first argument."""
+    """What `ends` calls. The first argument is this case."""
     probes: Callable[[StopFacts], bool] = _no
     """Returns True if the car could react to a `MODE00` now, and show it."""
     repeats_lost: bool = True
@@ -77,7 +77,7 @@ class StopCase:
     """True if the first renewals are `MODE00`, which clears half a named frame."""
 
     def ends(self, facts: StopFacts) -> "StopCase | None":
-        """Return the case as which a stop of this case ends without evidence now, or None if it does not end yet."""
+        """Return the case with which the stop ends now, without evidence. None if it does not end yet."""
         return self.rule(self, facts)
 
     def why(self, car: str) -> str:
