@@ -31,8 +31,8 @@ FIRST_RETRY_S: Final = 0.5
 MAX_RETRY_S: Final = 10.0
 """Maximum retry interval. Retries never end, because a starting gateway may know an e-stop that no other one knows."""
 SYNC_QUERY_TIMEOUT_S: Final = 2.5
-"""Time for the answers to one query. When two sites are linked again, they ask each other at once, and the link is
-full: with 1 s here and 5 % of the packets lost, an e-stop of one site needed 2 to 17 s to reach the other one."""
+"""Time for the answers to one query. When two sites are linked again, they ask each other at once, which fills the
+link. With a timeout of 1 s and 5 % of the packets lost, an e-stop needed 2 to 17 s from one site to the other."""
 MAX_SINGLE_QUERIES: Final = 8
 """Number of gateways that may always be queried one by one, whatever their share of the fleet is."""
 MAX_SINGLE_SHARE: Final = 0.5
@@ -81,7 +81,10 @@ class EstopSync:
         self._changed.set()
 
     def forward(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
-        """Send a fleet-wide e-stop, a pause, or the end of one to all gateways. Call it if only this car got it."""
+        """Send a fleet-wide e-stop, a pause, or the end of one to all gateways.
+
+        Call it for a command that came to this car only.
+        """
         fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
         payload: pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand
         match command.what:
@@ -97,7 +100,8 @@ class EstopSync:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
         if isinstance(command.what, Resume | Unpause):
-            # With the same id, one of the two would be refused as a duplicate: this copy, or the sender's own command.
+            # A car may get both this copy and the command of the sender. Give the copy an id of its own, so that neither is
+            # refused as a duplicate.
             payload.id = f"{command.id}-{self._car}"[-MAX_NAME_LENGTH:]
         key = keys.command_key(self._fleet, "*", command.verb, self._bus.identity)
         encoding = messages.encoding_of(COMMANDS[command.verb].message)

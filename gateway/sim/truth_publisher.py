@@ -92,8 +92,8 @@ class TruthPublisher:
 
     async def _open(self, loop: asyncio.AbstractEventLoop) -> Bus:
         """Open the bus, with retries."""
-        # Opening blocks, so it runs in a thread. The thread is a daemon, so that a hub that does not answer cannot keep
-        # the simulator from ending.
+        # Opening blocks, so it runs in a thread. The thread is a daemon, so that the simulator can end even if a hub
+        # does not answer.
         warn_at = loop.time() + HUB_WARNING_DELAY_S
         while True:
             if loop.time() >= warn_at:
