@@ -69,7 +69,7 @@ def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
 
 
 def clock_length_ns(text: str) -> int:
-    """Return the length of a time as people type it, ns: a minute if it has no seconds (`14:05`), else a second."""
+    """Return how long a typed time of day lasts, ns: a minute if it has no seconds (`14:05`), else a second."""
     return (60 if text.count(":") == 1 else 1) * _NS
 
 

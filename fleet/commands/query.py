@@ -46,7 +46,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     if tables and directory is None and sql is not None and Path(sql).is_dir():
         directory, sql = Path(sql), None
     if (sql is None) is not tables or (as_csv and as_json):
-        raise click.UsageError("give one question, or --tables; and --csv or --json, not both")
+        raise click.UsageError("give either a question or --tables, and at most one of --csv and --json")
     place = existing_sessions_place(directory)
     text = sys.stdin.read() if sql == "-" else sql or ""
     try:
