@@ -35,7 +35,7 @@ examples:
   fleet play
   fleet play --as rehearsal --rate 4 --loop
   fleet play --car red --from=-60s
-  fleet play latest --skip-gaps 5s # a pause in the recording lasts at most 5 s
+  fleet play latest --skip-gaps 5s # a gap in the recording lasts at most 5 s
 
 Look at it with `fleet list --fleet fleet-replay`, or run your own program on it."""
 )
@@ -53,7 +53,7 @@ Look at it with `fleet list --fleet fleet-replay`, or run your own program on it
     "--skip-gaps",
     "skip_gaps_s",
     type=Duration(_DAY_S),
-    help="Shorten pauses longer than DURATION to DURATION, such as 5s.",
+    help="Shorten gaps between messages that are longer than DURATION to DURATION, such as 5s.",
 )
 @click.option(
     "--cars-only", is_flag=True, help="Leave out the messages of the coordinator, the recorder and the supervisor."
@@ -148,7 +148,7 @@ def play(
     click.echo(f"{player.published} messages in {took_s:.1f} s")
     notes = {
         f"messages came over 0.25 s late: {rate:g} times as fast is too fast for this computer": player.late,
-        "pauses were shortened": schedule.shortened,
+        "gaps were shortened": schedule.shortened,
     }
     for note, count in notes.items():
         if count:

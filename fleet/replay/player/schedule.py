@@ -12,11 +12,11 @@ class Schedule:
 
     rate: float = 1.0
     longest_gap_ns: int | None = None
-    """Maximum pause. Longer pauses are shortened to it. None means no limit."""
+    """Maximum gap between messages. Longer gaps are shortened to it. None means no limit."""
     played_ns: int = 0
-    """Length of the recording played so far, with shortened pauses."""
+    """Length of the recording played so far, with shortened gaps."""
     shortened: int = 0
-    """Number of shortened pauses."""
+    """Number of shortened gaps."""
     _last_ns: int | None = None
 
     def due_s(self, at_ns: int) -> float:
