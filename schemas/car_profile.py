@@ -64,7 +64,7 @@ class CarProfile(Protocol):
         """True if a TCP port is the car's own. False if it belongs to a bridge, which outlives its clients."""
 
     def measurable(self, mode: Mode) -> frozenset[str]:
-        """Return the names of all readings that such a car can send in this mode: `range`, `battery`, `line`, ..."""
+        """Return the names of all readings that the car can send in this mode: `range`, `battery`, `line`, ..."""
 
     def why_lacking(self, capability: str) -> str | None:
         """Return a sentence on why the car lacks a capability. None if the car, or every car, has the capability."""

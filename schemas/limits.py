@@ -17,9 +17,9 @@ MAX_EVIDENCE_TIMEOUT_S: Final = 18.0
 """Maximum time for the evidence of a stop, in addition to its announced worst case: four intervals of the slowest car,
 which reports every 3 s, with the longest `MODE00` (`stop_in_progress.SLOWEST_S`). A car with an interval of 2.5 s or
 less has time for five reports."""
-# Without the pause the next sample of a held joystick would restart the car 50 ms after another person's stop.
-STREAM_PAUSE_S: Final = 0.5
-"""Minimum pause of a drive stream after a stop. A release ends the pause at once."""
+# Without this silence, the next sample of a held joystick would restart the car 50 ms after another person's stop.
+STREAM_SILENCE_S: Final = 0.5
+"""Minimum silence of a drive stream after a stop. A release counts as such a silence at once."""
 SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""
 MAX_REASON_LENGTH: Final = 200

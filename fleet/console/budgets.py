@@ -1,6 +1,6 @@
 """How much one page, one device and one person may ask of the console. Pure: time is an argument (s, monotonic).
 
-The console stops the cars for everybody, on one loop. So a page that sends without a pause must not slow down the
+The console stops the cars for everybody, on one loop. So a page that sends again and again must not slow down the
 others. Each has a budget far above what our own page can send, and a page that exceeds its budget is closed. STOP has
 no budget here: repeated STOPs are merged and never dropped, and a page that was closed still stops all cars by POST.
 """

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from schemas.limits import STREAM_PAUSE_S
+from schemas.limits import STREAM_SILENCE_S
 from schemas.rights import NO_PEOPLE, LeaseState, People, Sender
 from schemas.words import Rank
 
@@ -20,8 +20,8 @@ MAX_TICK_AGE_S: Final = 0.3
 """Maximum age of a tick when its echo arrives."""
 MAX_ECHO_GAP_S: Final = 0.3
 """Maximum time without an echo. When it has passed, the press is over."""
-# After a stop, a gateway rejects a stream of drives until its sender has paused. The added 0.1 s is one tick.
-AFTER_STOP_S: Final = STREAM_PAUSE_S + 0.1
+# After a stop, a gateway rejects a stream of drives until its sender has been silent. The added 0.1 s is one tick.
+AFTER_STOP_S: Final = STREAM_SILENCE_S + 0.1
 """Minimum time from a STOP to the next press."""
 _MAX_TICKS: Final = 16
 """Number of remembered ticks. It is larger than the number of ticks within the maximum age."""

@@ -100,8 +100,8 @@ class EstopSync:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
         if isinstance(command.what, Resume | Unpause):
-            # A car may get both this copy and the command of the sender. Give the copy an id of its own, so that neither is
-            # refused as a duplicate.
+            # A car may get both this copy and the command of the sender. With an id of its own, the copy does not make
+            # either of them a duplicate.
             payload.id = f"{command.id}-{self._car}"[-MAX_NAME_LENGTH:]
         key = keys.command_key(self._fleet, "*", command.verb, self._bus.identity)
         encoding = messages.encoding_of(COMMANDS[command.verb].message)

@@ -35,7 +35,7 @@ from gateway.control.driver import LATE_DRIVE_S, Desk, Driver
 from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
 from gateway.control.sender_presence import Senders
 from schemas.keys import name_of
-from schemas.limits import MAX_QUEUE_TIME_S, STREAM_PAUSE_S
+from schemas.limits import MAX_QUEUE_TIME_S, STREAM_SILENCE_S
 from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
@@ -176,7 +176,7 @@ class Controller(Generic[D_co]):
         if refusal is not None:
             return self._reject(pending, *refusal, now)
         if halted:
-            words = f"{self.car} was just stopped. Send no drive command for {STREAM_PAUSE_S:g} s, then drive again."
+            words = f"{self.car} was just stopped. Send no drive command for {STREAM_SILENCE_S:g} s, then drive again."
             return self._reject(pending, Reason.HELD, words, now)
         if lapsed := self._lapsed(command):
             return self._reject(pending, Reason.LAPSED, lapsed, now)

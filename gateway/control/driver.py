@@ -502,7 +502,7 @@ class Driver(ABC):
             self.stop_if_open(now)
 
     def halt(self, words: str, now: float, by: str = "") -> None:
-        """Drop all queued commands. Refuse a running stream of drives until its sender has paused."""
+        """Drop all queued commands. Refuse a running stream of drives until its sender has been silent."""
         self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self.safety.shorten_lease(now)
         self.senders.halt(now, by)

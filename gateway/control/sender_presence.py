@@ -1,9 +1,9 @@
-"""Tracks senders: lost liveliness tokens, and drive streams that must pause after a stop."""
+"""Tracks senders: lost liveliness tokens, and senders of drives that must be silent after a stop."""
 
 from dataclasses import dataclass, field
 from typing import Final
 
-from schemas.limits import STREAM_PAUSE_S
+from schemas.limits import STREAM_SILENCE_S
 
 SENDER_GONE_S: Final = 1.0
 """Timeout for a lost token. During a restart of the hub, all tokens disappear for half a second."""
@@ -51,9 +51,9 @@ class Senders:
     # ------------------------------------------------------------------ drive streams
 
     def may_drive(self, name: str, now: float, *, streamed: bool, release: bool) -> bool:
-        """Record a drive. Return False if its sender has not paused since the car was stopped."""
+        """Record a drive. Return False if its sender was not silent once since the car was stopped."""
         last, _ = self._drives.pop(name, (float("-inf"), False))
-        if release or now - last >= STREAM_PAUSE_S:
+        if release or now - last >= STREAM_SILENCE_S:
             self._halted.discard(name)
         self._drives[name] = now, streamed
         while len(self._drives) > MAX_SENDERS:
@@ -63,21 +63,21 @@ class Senders:
         return name not in self._halted
 
     def halt_streams(self, now: float) -> None:
-        """Require a pause of all streams: a joystick that was held before a loss must not drive the car after it."""
+        """Refuse each stream until it was silent: a joystick held before a loss must not drive the car after it."""
         self._halted.update(
-            name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_PAUSE_S
+            name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_SILENCE_S
         )
 
     def skip(self, slept_s: float) -> None:
-        """Count no sleep of the computer as a pause of a stream. Call it if the clock continues during a sleep."""
+        """Do not count a sleep of the computer as silence of a stream. Call it if the clock runs on meanwhile."""
         self._drives = {name: (last + slept_s, streamed) for name, (last, streamed) in self._drives.items()}
 
     def halt(self, now: float, by: str = "") -> None:
-        """Require a pause of all senders that have just driven, because the car was stopped."""
+        """Refuse all senders that have just driven until they were silent, because the car was stopped."""
         # The sender of the stop is exempt, unless it streams: a script may stop and drive again, a held joystick may
         # not.
         self._halted.update(
             name
             for name, (last, streamed) in self._drives.items()
-            if now - last < STREAM_PAUSE_S and (streamed or name != by)
+            if now - last < STREAM_SILENCE_S and (streamed or name != by)
         )

@@ -44,7 +44,7 @@ class PlainProfile:
         return bool(self.measures)
 
     def measurable(self, mode: Mode) -> frozenset[str]:
-        """Return the names of all readings that such a car can send in this mode."""
+        """Return the names of all readings that a car of this profile can send in this mode."""
         return self.measures if mode in self.modes else frozenset()
 
     def why_lacking(self, capability: str) -> str | None:

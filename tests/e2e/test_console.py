@@ -21,7 +21,7 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 from gateway.drivers.yahboom.protocol.frames import General, encode
-from schemas.limits import STREAM_PAUSE_S
+from schemas.limits import STREAM_SILENCE_S
 from schemas.words import Light, Motion, ServoAction
 from tests.support.console import CARS, ConsoleProcess, ConsoleStage, browser_process, pids
 from tests.support.processes import wait_for
@@ -375,7 +375,7 @@ def test_stops_wait_for_no_gateway_that_hangs(stage: ConsoleStage) -> None:
             page.keyboard.press("Escape")
 
         def drives() -> bool:
-            time.sleep(1.2 * STREAM_PAUSE_S)  # drives without this pause are refused after a stop, for ever
+            time.sleep(1.2 * STREAM_SILENCE_S)  # drives without this silence are refused after a stop, for ever
             return stage.person.car("blue").drive("forward", 10.0, wait=False).ok
 
         wait_for(drives, "the last stop is over")

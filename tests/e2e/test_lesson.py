@@ -15,7 +15,7 @@ import pytest
 from fleet.client.client import Fleet
 from fleet.fleetfile.fleet_file import read_fleet
 from fleet.supervisor.spec import UpOptions, build_spec
-from schemas.limits import STREAM_PAUSE_S
+from schemas.limits import STREAM_SILENCE_S
 from tests.e2e.test_newcomer import Newcomer, blocks, commands
 from tests.support import in_process
 from tests.support.ports import free_endpoint
@@ -65,7 +65,7 @@ class Lesson:
         driver = self._people[person].car(car)
         outcome = driver.drive("forward", LONG_S, wait=False)
         if outcome.reason == "held":
-            time.sleep(2 * STREAM_PAUSE_S)
+            time.sleep(2 * STREAM_SILENCE_S)
             outcome = driver.drive("forward", LONG_S, wait=False)
         outcome.check()
         wait_for(lambda: driving(self.sim, car), f"{car} drives")

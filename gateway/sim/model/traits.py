@@ -27,7 +27,7 @@ class CarTraits:
     close_s: float = 1.0
     """Time for which `MODEx0` blocks the program."""
     last_frame_wins: bool = False
-    """True if only the last of several whole frames in the buffer counts. In such a car, a `$` restarts the string."""
+    """True if only the last of several whole frames in the buffer counts. Then a `$` restarts the string."""
     silent_modes: frozenset[Mode] = frozenset()
     """Modes in which this car prints nothing, although the vendor's program prints there."""
     text: bool = False

@@ -4,7 +4,7 @@ import pytest
 
 from gateway.control.commands import Drive, EmergencyStop, Fan, Led, Lend, Pause, SetMode, Stop
 from gateway.control.refusals import AFTER_SLEEP_S
-from schemas.limits import STREAM_PAUSE_S
+from schemas.limits import STREAM_SILENCE_S
 from schemas.words import Basis, Mode, Motion, Phase, Reason
 from tests.gateway.control.workbench import MODE00, PERSON, RUN, SCRIPT, STOP, Workbench
 
@@ -114,7 +114,7 @@ def test_stream_must_pause_after_sleep(desk: Workbench, *, counted: bool) -> Non
         desk.run(0.05)
     sleep(desk, counted=counted)
     assert desk.ask(FORWARD, PERSON, streamed=True, age_s=0.0).reason is Reason.HELD
-    desk.run(STREAM_PAUSE_S)
+    desk.run(STREAM_SILENCE_S)
     assert desk.ask(FORWARD, PERSON, streamed=True, age_s=0.0).status is not Phase.REJECTED
 
 

@@ -21,7 +21,7 @@ from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.drivers.yahboom.stops.cases import CASES
 from schemas import messages, topics
 from schemas.commands import COMMANDS
-from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S, STREAM_PAUSE_S
+from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S, STREAM_SILENCE_S
 from schemas.words import UNKNOWN, CarTrust, Mode, Platform
 from tests.support import vectors
 from tests.tools.vectors import STOPS
@@ -198,7 +198,7 @@ def numbers() -> dict[str, str]:
         "repeat": f"{REPEAT_INTERVAL_S:g} s",
         "renewals": f"{RENEWAL_INTERVALS_S[0]:g} s, {RENEWAL_INTERVALS_S[1]:g} s and then every "
         f"{RENEWAL_INTERVALS_S[2]:g} s",
-        "stream_pause": f"{STREAM_PAUSE_S:g} s",
+        "stream_silence": f"{STREAM_SILENCE_S:g} s",
         "longest_drive": f"{DEFAULT_MAX_DRIVE_S:g} s",
         "sender_gone": f"{SENDER_GONE_S:g} s",
         "stall": f"{STALL_S:g} s",

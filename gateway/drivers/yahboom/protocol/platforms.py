@@ -340,7 +340,7 @@ class Profile:
         return found
 
     def measurable(self, mode: Mode) -> frozenset[str]:
-        """Return the names of all readings that such a car can send in this mode, without constants of the platform."""
+        """Return the names of all readings that the car can send in this mode, without constants of the platform."""
         if mode not in self.modes or mode in self.silent_modes:
             return frozenset()
         if mode is not Mode.MANUAL:
