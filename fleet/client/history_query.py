@@ -83,10 +83,10 @@ def describe_shortfalls(
         full = len(found) >= topic.history_size
         if since_s is not None:
             if full and oldest_s < since_s and (last is None or last > topic.history_size):
-                lines.append(f"{key}: goes back only {oldest_s:.1f} s, not {since_s:g} s: {keeps}")
+                lines.append(f"{key}: goes back {oldest_s:.1f} s of {since_s:g} s, because {keeps}")
         elif last is not None and len(found) < last:
             more = keeps if full else "its gateway has no more"
-            lines.append(f"{key}: {len(found)} of {last}: {more}")
+            lines.append(f"{key}: {len(found)} of {last}, because {more}")
     if has_states and last != 1:
         lines.append("Gateways keep only the latest value of a state. A recording has all (`fleet record`).")
     return lines
