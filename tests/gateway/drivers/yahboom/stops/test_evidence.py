@@ -114,7 +114,7 @@ def test_block_gap_around_mode00_is_found_once(reports: list[float], found: list
 
 
 @pytest.mark.parametrize("interval_s", [0.32, 0.71, 1.254, 1.493, 2.2, 3.0])
-def test_two_pauses_show_a_stop_and_one_does_not(interval_s: float) -> None:
+def test_two_block_gaps_show_a_stop_and_one_does_not(interval_s: float) -> None:
     watch = EvidenceWatch(known(interval_s))
     each_s = interval_s + BLOCK_S
     first = watch.gap(10.0)
@@ -129,7 +129,7 @@ def test_two_pauses_show_a_stop_and_one_does_not(interval_s: float) -> None:
     assert BLOCK_GAPS == 2
 
 
-def test_three_pauses_are_needed_if_one_exceeds_block() -> None:
+def test_three_block_gaps_are_needed_if_one_exceeds_block() -> None:
     """A link that delays a report, and a damaged frame that opens mode 0 for 2.3 s, make two gaps like block gaps."""
     watch = EvidenceWatch()
     assert watch.gap(10.0, 1.4) is BLOCK_GAP
@@ -138,7 +138,7 @@ def test_three_pauses_are_needed_if_one_exceeds_block() -> None:
     assert watch.evidence.words == "3 gaps in its reports, each after MODE00"
 
 
-def test_pause_with_second_block_may_be_longer() -> None:
+def test_block_gap_with_second_block_may_be_longer() -> None:
     watch = EvidenceWatch()
     watch.reports(10.0)
     watch.evidence.on_block(Blocking.WHISTLE, 0.3, 10.1)
@@ -184,14 +184,14 @@ def test_delay_longer_than_time_since_mode_00_is_not_its_own() -> None:
     assert watch.learned.blocks == {}
 
 
-def test_pauses_before_a_motion_do_not_count() -> None:
+def test_block_gaps_before_a_motion_do_not_count() -> None:
     watch = EvidenceWatch()
     assert watch.gap(40.0) is BLOCK_GAP
     watch.evidence.on_motion()
     assert watch.gap(43.5) is BLOCK_GAP, "the car may have moved since the first one"
 
 
-def test_lost_report_differs_from_pause_by_length() -> None:
+def test_lost_report_differs_from_block_gap_by_length() -> None:
     """The link loses `MODE00` and the report after it, three times: 2.50 s, where a block gap is 2.25 s."""
     watch = EvidenceWatch()
     for number in range(3):
@@ -252,7 +252,7 @@ def test_bunched_reports_begin_anew(gaps: list[float]) -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0.3, 0.9, 1.25, 2.2])
-def test_report_too_early_after_last_pause_was_held_by_link(interval_s: float) -> None:
+def test_report_too_early_after_last_block_gap_was_held_by_link(interval_s: float) -> None:
     """The link holds a report for a second. The next one comes an interval after it was due."""
     watch = EvidenceWatch(known(interval_s))
     each_s = interval_s + BLOCK_S
@@ -289,7 +289,7 @@ def test_stop_frame_behind_own_block_shows_nothing() -> None:
     assert list(watch.learned.echo.intervals) == [INTERVAL_S] * 6, "the interval of that frame is no measure"
 
 
-def test_reset_times_forgets_pause_after_loop_slept() -> None:
+def test_reset_times_forgets_block_gap_after_loop_slept() -> None:
     watch = EvidenceWatch()
     assert watch.gap(10.0) is BLOCK_GAP
     watch.reports(13.5)
@@ -323,7 +323,7 @@ def test_report_without_echo_shows_no_stop(without: int) -> None:
 # ---------------------------------------------------------------------- what is learned
 
 
-def test_pause_is_unjudged_before_rhythm_is_known() -> None:
+def test_block_gap_is_unjudged_before_rhythm_is_known() -> None:
     watch = EvidenceWatch(Learned())
     watch.closed(9.9)
     assert watch.reports(11.0) == [UNJUDGED]
@@ -455,7 +455,7 @@ def test_general_stop_after_mode00_leaves_left_mode_unshown() -> None:
     [(0.01, [BLOCK_GAP, SETTLING]), (LATE_S - 0.01, [BLOCK_GAP, SETTLING]), (LATE_S + 0.01, [REPORT, BLOCK_GAP])],
 )
 @pytest.mark.parametrize("mode", [Mode.TRACKING, Mode.COLOR_LED], ids=str)
-def test_single_report_on_slow_link_counts_as_pause(mode: Mode, late_s: float, found: list[Finding]) -> None:
+def test_single_report_on_slow_link_counts_as_block_gap(mode: Mode, late_s: float, found: list[Finding]) -> None:
     watch = tracking(10.0) if mode is Mode.TRACKING else silent()
     watch.closed(10.0)
     at = 10.0 + LEFT_S + late_s
@@ -607,7 +607,7 @@ def test_stop_cases_are_all_tested() -> None:
     assert {row[0] for row in ROWS} | elsewhere == set(cases.CASES)
 
 
-def test_line_ends_between_reports_hide_no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_line_ends_between_reports_hide_no_block_gap(monkeypatch: pytest.MonkeyPatch) -> None:
     """CR and LF may follow `#` (docs/reference/protocol.md#framing)."""
     desk = Workbench().ready()
     hear = desk.hear
