@@ -18,7 +18,7 @@ from gateway.drivers.waveshare.driver import ALLOWED, DRIVE, PWM
 from gateway.sim.car_options import UGV_OPTIONS
 from gateway.sim.model.factory import build_ugv
 from gateway.sim.model.ir_remote import Button
-from gateway.sim.model.ugv import LOOP_S, UGV_BUILDS, UGV_DEAD_MAN_S, WIFI_S
+from gateway.sim.model.ugv import LOOP_S, PAGE_OPEN_S, UGV_BUILDS, UGV_DEAD_MAN_S, WIFI_S
 from gateway.sim.model.world import World
 from schemas.rights import Sender
 from schemas.words import Basis, Light, Motion, Motors, Phase, Rank, Reason, SpeedStep
@@ -79,6 +79,8 @@ class UgvEpisode:
         self.busy_until = 0.0
         """When a search for Wi-Fi is over, and what another program let it do."""
         self.page_until = float("-inf")
+        self.page_closed_at = float("-inf")
+        """When the page of the car is closed. Until then, its questions look like a stream of feedback."""
         self.cut_at: float | None = None
         self.stop_due: float | None = None
         self.ids = 0
@@ -203,7 +205,7 @@ class UgvEpisode:
 
     def drive_usefully(self) -> None:
         """Drive a calm car. It moves soon, and stands soon after its drive."""
-        self.run(max(0.0, self._calm_from + SETTLED_S - self.now))
+        self.run(max(0.0, max(self._calm_from, self.page_closed_at) + SETTLED_S - self.now))
         self.page_until = min(self.page_until, self.now)
         self.run(1.0)
         for estop in self.control.safety.estops:
@@ -252,6 +254,7 @@ class UgvEpisode:
                 self.run(self.page_until - self.now)
                 self.car.press(Button.STOP, self.now)
                 self.page_until = self.now + 2.0
+                self.page_closed_at = self.now + PAGE_OPEN_S
                 self.calm_since = self.now
             case 3:
                 self.loss = moments.choice((0.05, 0.3, 1.0))
