@@ -272,7 +272,7 @@ class CarGateway:
         return self._loop.time() < self._began_at + RIVAL_SHUTDOWN_S and await self._has_rival()
 
     def _log_link_open(self) -> None:
-        """Log that the link is open, and if the saved knowledge about the car is not used, why."""
+        """Log that the link is open. If saved knowledge about the car is not used, log why."""
         if self._learned_file.trouble:
             self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
             self._learned_file.trouble = ""

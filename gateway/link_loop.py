@@ -29,7 +29,7 @@ MAX_BYTES_AGE_S: Final = 0.25
 MIN_DAMAGED: Final = 3
 """Number of damaged frames after which the link looks for the cause."""
 LOOK_INTERVAL_S: Final = 10.0
-"""Minimum interval of these looks."""
+"""Minimum interval at which the link looks for the cause of damage."""
 FLOOD_LOG_PAUSE_S: Final = 10.0
 """Minimum time since the last bytes of a flood before another flood is logged."""
 BITS_PER_BYTE: Final = 10
@@ -52,8 +52,8 @@ class LinkLoop:
     ) -> None:
         """Call `on_gap` to detect a gap of the loop before bytes are judged.
 
-        Call `log_open` when an opening of the link should be logged: at once, or if the last link was lost soon, once
-        this one is proven (`Attempts`).
+        Call `log_open` when the opening of the link should be logged. That is at once, or, if the last link was soon
+        lost, when this one is proven (`Attempts`).
         """
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()

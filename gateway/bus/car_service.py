@@ -115,7 +115,7 @@ class CarService:
         cars: "Callable[[Mapping[str, bool]], object]",
         poses: "Callable[[Mapping[str, bus.Sample]], object]",
     ) -> None:
-        """Connect the handlers, also to items that wait already.
+        """Connect the handlers. They also get the items that wait already.
 
         `senders` and `cars` are called with changes of tokens by name. `values` and `histories` are set when there are
         queries. `poses` is called with the newest published pose, which may be the gateway's own.

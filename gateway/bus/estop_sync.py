@@ -23,7 +23,7 @@ from schemas.words import Scope
 BATCH_DELAY_S: Final = 0.2
 """Delay before a query, so that gateways that start together are queried together."""
 MAX_BATCH_DELAY_S: Final = 3.0
-"""Maximum of that delay, which doubles while more gateways start."""
+"""Maximum delay before a query. The delay doubles while more gateways start."""
 BATCH_RESET_S: Final = 1.0
 """Time without a new gateway after which the delay begins at `BATCH_DELAY_S` again."""
 FIRST_RETRY_S: Final = 0.5
@@ -100,8 +100,8 @@ class EstopSync:
                 return
         payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
         if isinstance(command.what, Resume | Unpause):
-            # A car may get both this copy and the command of the sender. With an id of its own, the copy does not make
-            # either of them a duplicate.
+            # A car may get both this copy and the command of the sender. With one id for both, the second would be
+            # refused as a duplicate.
             payload.id = f"{command.id}-{self._car}"[-MAX_NAME_LENGTH:]
         key = keys.command_key(self._fleet, "*", command.verb, self._bus.identity)
         encoding = messages.encoding_of(COMMANDS[command.verb].message)

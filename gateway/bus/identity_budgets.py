@@ -1,6 +1,6 @@
 """Limits how many messages of each identity a gateway reads, so that one person's flood does not use up its time.
 
-On a bus with certificates, the key of a drive of a stream has the sender's identity. Only the key is read here, so a
+On a bus with certificates, each drive of a stream has the sender's identity in its key. Only the key is read here, so a
 message over the budget costs one callback, but no copy and no turn of the loop. The budget is ten times what a joystick
 sends. On a bus without certificates, the sender is only known after a message was read, and may use any name. So there,
 only the queue behind this limits a flood.

@@ -42,8 +42,8 @@ from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason,
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
-"""A drive waits for the car as long as announced, or for its own duration if that is longer, and so much longer, before
-it expires."""
+"""A drive that waits for the car expires after the announced wait, or after its own duration if that is longer, and
+this margin."""
 
 
 class Controller(Generic[D_co]):
@@ -129,7 +129,7 @@ class Controller(Generic[D_co]):
         return f"{what}, for {left_s:.1f} s at most"
 
     def is_free(self, now: float) -> bool:
-        """Return True if a command would be sent now, from somebody who may command the car."""
+        """Return True if a command of somebody who may command the car would be sent now."""
         return self.driver.model.link_open and self.driver.accepts_commands(now)
 
     def wait_s(self, what: Action, now: float) -> float:
@@ -144,7 +144,7 @@ class Controller(Generic[D_co]):
         self.driver.tick(now)
 
     def on_sleep(self, slept_s: float, now: float, *, counted: bool) -> None:
-        """Stop the car after a sleep of the computer, and end the lease. `counted`: `now` has counted the sleep."""
+        """Stop the car after a sleep of the computer, and end the lease. `counted`: `now` includes the sleep."""
         self._slept_at = now
         self.safety.lease = None
         if counted:
@@ -238,7 +238,7 @@ class Controller(Generic[D_co]):
             self.safety.mark_holder(name, connected=alive)
 
     def merge_estops(self, estops: Iterable[Estop], ended: Iterable[str], source: str, now: float) -> None:
-        """Merge the fleet-wide e-stops, in force and ended, of another gateway of the fleet."""
+        """Merge the fleet-wide e-stops of which another gateway of the fleet knows: those in force and those ended."""
         latched, removed = self.safety.merge(estops, ended)
         for estop in removed:
             words = f"e-stop {estop.id} of {self.car} was ended elsewhere (seen from {source})"
@@ -254,7 +254,7 @@ class Controller(Generic[D_co]):
         self.halt(words, now)
 
     def merge_pauses(self, pauses: Iterable[FleetPause], ended: Iterable[str], source: str, now: float) -> None:
-        """Merge the pauses, in force and ended, of another gateway of the fleet."""
+        """Merge the pauses of which another gateway of the fleet knows: those in force and those ended."""
         joined, removed = self.safety.merge_pauses(pauses, ended)
         if removed:
             self._log.log(

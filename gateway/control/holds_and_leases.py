@@ -102,7 +102,8 @@ class Safety:
     def latch(self, estop: Estop) -> Estop:
         """Latch an e-stop and put the car on hold. An e-stop whose id has already ended gets a new id.
 
-        If too many are in force, it is not latched. The car stays stopped anyway, until all of those are released.
+        If too many e-stops are in force, do not latch this one. The car stays stopped anyway, until all of those are
+        released.
         """
         if estop.id in self._ended:
             estop = replace(estop, id=f"{estop.id}.{estop.at_ns:x}")

@@ -32,7 +32,7 @@ MAX_QUEUED_COMMANDS: Final = 8
 MAX_AHEAD_S: Final = 5.0
 """Maximum time by which `asked` may lie in the future. The clocks of computers that use NTP differ by less."""
 CLOCK_DOUBT_S: Final = 30.0
-"""Lateness of a command from which on a wrong clock is a more likely cause than a slow network."""
+"""If a command is later than this, a wrong clock is a more likely cause than a slow network."""
 AFTER_SLEEP_S: Final = 2.0
 """Time after a sleep of the computer during which a command without `asked` may be from before the sleep."""
 

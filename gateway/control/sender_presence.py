@@ -51,7 +51,7 @@ class Senders:
     # ------------------------------------------------------------------ drive streams
 
     def may_drive(self, name: str, now: float, *, streamed: bool, release: bool) -> bool:
-        """Record a drive. Return False if its sender was not silent once since the car was stopped."""
+        """Record a drive. Return False if the car was stopped, and the sender has not been silent since then."""
         last, _ = self._drives.pop(name, (float("-inf"), False))
         if release or now - last >= STREAM_SILENCE_S:
             self._halted.discard(name)

@@ -48,10 +48,10 @@ from schemas.words import Light as LightWord
 
 CHECK_STEP_S: Final = 0.02
 FIRST_STOP_S: Final = 1.0
-"""Maximum time from a person's stop to its first frame, unless a longer worst case is announced."""
+"""Maximum time from a person's stop to its first frame, unless the driver announces a longer worst case."""
 JOINED_S: Final = 7.0
-"""A new stop joins one that is still going on, and its frame may be the next repeat of that one. This is the maximum
-age of the running stop's last frame."""
+"""A new stop may join a running one, whose frames then count for it. They may be at most this much older than the new
+stop."""
 MAX_FRAMES_AT_ONCE: Final = 50
 ACTIONS: Final[tuple[Action, ...]] = (
     Led(1, 2, 3),
@@ -422,8 +422,8 @@ def check_hostile(family: Family, platform: str) -> Iterator[str]:
 def check_rest(family: Family, platform: str) -> Iterator[str]:
     """Check that a car which moves never counts as one that has shown its stop.
 
-    `MOVING` of the module has bytes of a car that moves. It is required if `SAMPLES` show a stop, because then perhaps
-    any report of such a car would show one.
+    `MOVING` of the module has bytes of a car that moves. If `SAMPLES` show a stop, `MOVING` is required, because
+    perhaps any report of the car would count as one that shows a stop.
     """
     standing = _connected(family, platform, _samples(family))
     standing.ask(Stop())
@@ -456,7 +456,7 @@ def check_stop(family: Family, platform: str) -> Iterator[str]:
         stop = bench.ask(Stop())
         bench.run(30.0)
         announced_s = max((each.worst_case_s for each in bench.records if each.command.id == stop), default=0.0)
-        # It may join a stop that is still going on. Then that stop's frames count.
+        # The stop may have joined one that is still going on. Then the frames of that one count.
         from_s, until_s = asked_at - JOINED_S, asked_at + max(FIRST_STOP_S, announced_s)
         if not any(at <= until_s for at in bench.stop_frames(from_s)):
             limit_s = until_s - asked_at

@@ -4,9 +4,9 @@ Such a car continues a motion until it gets another one, or until its dead-man t
 of frames. It has no modes. A family defines its frames, and what its readings show, with class attributes and a few
 methods. Waiting, repeating, failing and recording are done here (docs/how-to/write-a-driver.md).
 
-*Claims.* A stop ends as `sent` when its frames are written and the time has passed within which a car that received
-them has stopped. A family whose readings show more calls `show_rest`; then the stop ends as `shown`. If its cars could
-show a stop (`can_show`) but do not in time, the stop counts as not confirmed, and the driver continues to send it.
+*Claims.* A stop ends as `sent` when its frames are written and a car that received them has had time to stop. A family
+whose readings show more calls `show_rest`; then the stop ends as `shown`. If its cars could show a stop (`can_show`)
+but do not in time, the stop counts as not confirmed, and the driver continues to send it.
 
 *Safe motions.* If a car has a dead-man timer, a held motion is sent again well before that time is over. So one lost
 frame does not stop the car, but a lost link does. If it has none, a stop that no reading shows is sent again every few
@@ -177,7 +177,7 @@ class PlainStop:
     last_at: float = float("-inf")
     """When the first try's last frame was written; -inf before."""
     is_late: bool = False
-    """True if the car did not show it in time. The driver continues to send it."""
+    """True if the car did not show the stop in time. The driver continues to send it."""
 
 
 class PlainDriver(Driver):
@@ -222,7 +222,7 @@ class PlainDriver(Driver):
         """Return the frame of a motion at `self.model.speed`. LEFT is a curve, SPIN_LEFT turns on the spot."""
 
     def stop_frame(self, index: int) -> bytes:
-        """Return the frame of a stop at this place. The last one is also sent alone, to repeat the stop."""
+        """Return the frame number `index` of a stop, from 0. The last one is also sent alone, to repeat the stop."""
         del index
         return self.motion_frame(Motion.STOP)
 
@@ -407,7 +407,7 @@ class PlainDriver(Driver):
         if now < self._part_at or (pending := self.queue.next_part(now)) is None:
             return None
         data, held = pending.next_frame, self.queue.held
-        if isinstance(pending.command.what, ChangeSpeed):  # send the present motion: that at its arrival may be over
+        if isinstance(pending.command.what, ChangeSpeed):  # the motion at its arrival may be over: send the present one
             is_driven = held is not None and held.pending.sent and self._stop is None
             data = self.motion_frame(held.motion if held is not None and is_driven else Motion.STOP)
         return self._write(data, FrameOrigin.COMMAND, pending)

@@ -21,9 +21,9 @@ class PlainProfile:
     baud: int = 115200
     """Rate of its serial port."""
     dead_man_s: float | None = None
-    """Time after which it stops because no *motion* arrived; then stops that no reading shows are not repeated. None if
-    there is no such time. A car that only watches its link (a heartbeat, a closed connection) has none, because it
-    drives on while the link is alive."""
+    """Time after which the car stops because no *motion* arrived. With such a time, stops that no reading shows are not
+    repeated. None if there is no such time. A car that only watches its link (a heartbeat, a closed connection) has
+    none, because it drives on while the link is alive."""
     not_observed: tuple[str, ...] = ()
     """Facts that were read or assumed, but not seen on a car, as sentences."""
     has_network: bool = True

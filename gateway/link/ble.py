@@ -1,8 +1,8 @@
 """A car's Bluetooth LE module through bleak: finds the device and its characteristics, and writes frames in pieces.
 
-The link is lost when the system reports a disconnect, or when a write fails. Whether a silent car is lost is for the
-caller to judge. bleak's `is_connected` is not used, because it stays true when the system's Bluetooth service dies.
-bleak's clean-up has no timeout, so its calls run in a task that is cancelled again and again until it ends.
+The link is lost when the system reports a disconnect, or when a write fails. The caller judges whether a silent car is
+lost. bleak's `is_connected` is not used, because it stays true when the system's Bluetooth service dies. bleak's
+clean-up has no timeout, so its calls run in a task that is cancelled again and again until it ends.
 """
 
 import asyncio
@@ -68,8 +68,8 @@ _UARTS: Final = (
     ((_uuid(0xFFF0),), (_uuid(0xFFF1),), (_uuid(0xFFF2),)),
     ((_NORDIC.format(1),), (_NORDIC.format(3),), (_NORDIC.format(2),)),
 )
-"""The services of a UART over BLE; its characteristics from the car, in order of preference; and those to the car
-(docs/reference/protocol.md#framing)."""
+"""The kinds of UART over BLE. Each has its services, then the characteristics from the car and those to the car, both
+in order of preference (docs/reference/protocol.md#framing)."""
 UART_SERVICES: Final = tuple(service for services, _, _ in _UARTS for service in services)
 
 

@@ -3,8 +3,8 @@
 An adapter can make only one connection at a time. BlueZ refuses a second attempt meanwhile (InProgress): without turns,
 40 % of the attempts of several gateways failed that way. So the gateways of one user take turns: each adapter has a
 lock, a file in the state directory, which is released when its holder ends. A car that may be moving goes first: its
-gateway takes a second lock, its lane, and while that is taken, the other gateways do not even try. Only connecting
-needs a turn. A stop is a write on an open link, and never waits.
+gateway takes a second lock, the lane. While the lane is taken, other gateways do not even try. Only connecting needs a
+turn. A stop is a write on an open link, and never waits.
 """
 
 import asyncio

@@ -19,8 +19,8 @@ from schemas.links import TcpUrl
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 
 SAID_WITHIN_S: Final = 3.0
-"""Time within which a bridge that already has a client sends a text about that, and closes the connection. Bytes of a
-connection that lasts longer are those of a car."""
+"""Time within which a bridge that already has a client sends a text about that, and closes the connection. If a
+connection lasts longer, its bytes are those of a car."""
 MAX_SAID_BYTES: Final = 120
 """Maximum bytes of the text of a bridge that an error message quotes."""
 
@@ -183,7 +183,7 @@ def _resolve(url: TcpUrl, found: "Future[_Addresses]") -> None:
 
 async def connect_first(url: TcpUrl, addresses: Iterable[tuple[int, Any]]) -> Link:
     """Connect to the first (family, socket address) that accepts. If none does, raise the first OSError."""
-    # Not `create_connection` with a name: it hides the error numbers of several addresses in one text.
+    # `create_connection` with a name would hide the error numbers of several addresses in one text.
     loop = asyncio.get_running_loop()
     first: OSError | None = None
     for family, address in addresses:

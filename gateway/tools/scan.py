@@ -134,7 +134,7 @@ class _Scan:
             if probe.trouble is None and probe.verdict in (LinkVerdict.SILENT, LinkVerdict.CAR)
         ]
         if not probed:
-            cli_support.print_note("nothing to probe: on no open port is there a car, and no open port is silent")
+            cli_support.print_note("nothing to probe: no open port has a car or is silent")
             return
         frames = ", ".join(encode(step.frame).decode() for step in GENERAL.steps)
         where = ", ".join(str(probe.url) for probe in probed)

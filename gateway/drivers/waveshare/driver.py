@@ -18,18 +18,21 @@ beyond 2.0, the car ignores them, but the line still resets the timer. Only the 
 obeys. But it gives our readings an order: a feedback that arrives after the repeated stop was made after the stop. If
 its wheel speeds are measured, and are zero from then on for a quarter of a second, the car stands still. Measured means
 three things: the chassis has encoders, we have configured the car, and both wheels were seen to turn in a drive of ours
-since then, as an encoder with a loose wire reports zero for ever. Any other stop ends as `sent`; the timer must do.
+since then, as an encoder with a loose wire reports zero for ever. Any other stop ends as `sent`, and we rely on the
+timer.
 
 *Lost settings.* We would not notice a setting that was lost on the link. So the chassis and the dead-man time are sent
 until the car has repeated them. A car that repeats no line gets them three times if its feedback arrives at the
 interval that we asked for, else ten times. Then it may be driven, although it cannot confirm them.
 
 *The first bytes.* At each boot, the car plays a mission that its owner may have stored, and any byte on the UART aborts
-it. So after the link is open we listen before we write, and wait for the end of a boot. Only a person's stop does not.
+it. So after the link is open we listen before we write, and wait for the end of a boot. Only a person's stop does not
+wait.
 
 *Other programs.* The car has a web page with a known password, and accepts commands by radio. Both reset the dead-man
 timer. So if wheels turn while our last command is a stop, that is logged, and the car is stopped. Without encoders no
-reading shows that. But an open web page sends queries, whose answers the car prints here, too, so it is always logged.
+reading shows that. But an open web page sends queries, and the car prints the answers here, too. So an open page is
+logged on every car.
 """
 
 import json
@@ -166,7 +169,7 @@ class WaveshareDriver(PlainDriver):
         self._setup, self._setup_at = Setup.LISTEN, listen_until
         self._listen_until = listen_until + LISTEN_MAX_S
         self._booting = False
-        """True if it prints the text of a boot."""
+        """True if the car prints the text of a boot."""
         self._sent.clear()
         self._unechoed = 0
         """Number of frames of stops since the last echo."""
@@ -178,7 +181,7 @@ class WaveshareDriver(PlainDriver):
         self._unsure: list[bytes] = []
         """The settings that the car has not repeated yet."""
         self._tries = 0
-        """How often they were sent while feedback arrived."""
+        """How often the settings were sent while feedback arrived."""
         self._was_heard = self._echoes = False
         self._feedback_at = float("-inf")
         self._in_rhythm = 0
@@ -457,7 +460,7 @@ class WaveshareDriver(PlainDriver):
 
     @property
     def hears(self) -> bool:
-        """Return False while it may be booting: lines that are written then are lost or read later."""
+        """Return False while the car may be booting: lines that are written then are lost or read later."""
         return self._setup is not Setup.LISTEN
 
     def setup_at(self) -> float:
@@ -531,8 +534,8 @@ class WaveshareDriver(PlainDriver):
     def stop_frame(self, index: int) -> bytes:
         """Return a line of a stop: twice power zero, then speed zero. The number marks its echo.
 
-        While power is set directly, the speed loop keeps its integral, and would continue with it. It drops the
-        integral when the wheels stand still. So the speed is set last, and not at once.
+        The speed loop has an integral, which it keeps while power is set directly, and drops when the wheels stand
+        still. If the speed were set at once, the loop would continue with the old integral. So the speed is set last.
         """
         self._number += 1
         if index == self.STOP_FRAMES - 1:

@@ -137,12 +137,12 @@ class CarModel:
 
     @property
     def rest_is_sure(self) -> bool:
-        """Return True if the car is at rest, and has shown it, or need not or cannot show it."""
+        """Return True if the car is at rest, and has shown that, need not show it, or cannot show it."""
         return self.at_rest and (self.trust.shown or self.rest_case.is_sure or not self.can_show)
 
     @property
     def can_show(self) -> bool:
-        """Return True unless it is known that this car cannot show a stop, by its program or by its reports."""
+        """Return False if the program or the reports of this car show that it cannot show a stop."""
         match self.stop_style:
             case StopStyle.GENERAL:
                 return False

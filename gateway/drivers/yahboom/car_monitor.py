@@ -61,7 +61,7 @@ class CarMonitor:
             model.treat_as(model.platform.profile)
 
     def link_down(self) -> None:
-        """Forget the platform from before this link, if the car was silent after a frame that only it understands."""
+        """Forget the remembered platform, if the car was silent after a frame that only this platform understands."""
         model = self.model
         is_silent = model.mode_closed_at > model.link_since > model.mode.heard_at
         if model.platform.is_remembered and is_silent:
@@ -174,7 +174,7 @@ class CarMonitor:
         before = model.profile.kind
         model.treat_as(model.platform.profile)
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
-        if model.platform.auto:  # else a configured platform was corrected, which its contradiction has reported
+        if model.platform.auto:  # else a contradiction has reported the corrected platform
             self._log.log(Level.INFO, "platform_settled", words, now)
         if has_other_head and self._is_idle:  # a drive has frames without a head: neither end nor delay it
             self._stops.recover(now, words)

@@ -196,7 +196,7 @@ class YahboomDriver(Executor):
                 return ()
 
     def _blinks(self) -> tuple[Frame, ...]:
-        """Return the frames of `find`. The last one restores the LED color, or sets the last one that is queued."""
+        """Return the frames of `find`. The last one restores the LED color, or sets the color that was queued last."""
         frames = [frame_of(each) for act in self.queue.one_shots for each in act.frames]
         waiting = [each for each in frames if isinstance(each, ColorLed)]
         led = waiting[-1] if waiting else self.model.believed.led

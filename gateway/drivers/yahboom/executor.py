@@ -29,12 +29,13 @@ FREE_ACTIONS: Final = 3
 """Number of actions on parts of the car that are written at once. In a stream of more, the next ones may have to
 wait."""
 LISTEN_LIMITS: Final = 2.0
-"""Time without a report after which a stream of actions waits for one, in silences that would contradict the mode."""
+"""Time without a report after which a stream of actions waits for one. The unit is the silence that contradicts the
+mode."""
 NOTICE_S: Final = 2 * TICK_S
 """Maximum time within which a silence is noticed: the ticks of a busy gateway come late."""
 NO_REPEAT_S: Final = 2 * FLIGHT_S
-"""Time before the end of a drive in which its motion is not repeated. A report of the car takes 43 ms, and if an stm32
-car sends one then, it loses the stop that follows the repeated motion."""
+"""Time before the end of a drive in which its motion is not repeated. An stm32 car that is sending a report, which
+takes 43 ms, would lose the stop that follows the repeated motion."""
 
 
 class Executor(Driver):
@@ -89,8 +90,8 @@ class Executor(Driver):
     def accepts_commands(self, now: float) -> bool:
         """Return True if a command's frame may be written: no stop is in progress, or a new command may replace it.
 
-        Missing evidence of a stop delays no single command. Only the stop's first frames do, until their worst case is
-        over. What delays a stream of actions: `_stop_goes_first`.
+        A single command waits only for the first frames of a stop, until their worst case is over. It does not wait for
+        evidence. `_stop_goes_first` says for what a stream of actions waits.
         """
         running = self.stops.running
         if running is None:
@@ -226,7 +227,7 @@ class Executor(Driver):
     def _is_listening(self, now: float) -> bool:
         """Return True if a stream of actions has blocked the car for so long that it must send a report first.
 
-        A block excuses a silence. So during an endless stream nobody would notice that a car drives that lost its stop.
+        A block excuses a silence. So during an endless stream nobody would notice a car that lost its stop and drives.
         """
         mode = self.model.mode
         if not self._has_stream_since(mode.heard_at):
@@ -244,9 +245,10 @@ class Executor(Driver):
     def _stop_goes_first(self, now: float) -> bool:
         """Return True if a stream of actions on parts of the car waits for the running stop.
 
-        It waits for the repeats. Otherwise a color every 0.3 s would put off the repeats of a lost stop for ever, and
-        the car would drive on. It also waits for evidence, because each action changes the times of the reports that
-        would show the stop; if a mode waits behind the actions, only as long as the next report may complete it.
+        The stream waits for the repeats. Otherwise a color every 0.3 s would put off the repeats of a lost stop for
+        ever, and the car would drive on. It also waits for evidence, because each action changes the times of the
+        reports that would show the stop. But if a mode waits behind the actions, they wait only as long as the next
+        report may complete the evidence.
         """
         running = self.stops.running
         if running is None or not self._has_stream_since(running.began_at):

@@ -8,10 +8,10 @@ nobody sent. Most of the hazards in docs/reference/protocol.md have this cause.
 
 So a frame should be alone in the buffer when the car reads it. The difficulty is that the car does not say when it
 reads. `Pacing` estimates two times for the last frame. Its *flight* is the time during which it is certainly under way:
-60 ms, or its own block if that is longer. The time by which it is *read* is a worst case: at once if the car is awake,
-as its last report shows; otherwise after the longest ranging; and in both cases later by the block of any frame that
-waited before it. A report that was sent after the write shows that the loop has read the buffer, so the time can be set
-to an earlier one.
+60 ms, or its own block if that is longer. The time by which it is *read* is a worst case. If the last report shows that
+the car is awake, the car reads the frame at once, else after the longest ranging. Both times are later by the block of
+any frame that waited before it. A report that was sent after the write shows that the loop has read the buffer, so the
+time becomes earlier.
 
 Callers say how careful they must be (`Gate`). A stop waits only for the flight, because a stop that waits for certainty
 is late, and its repetitions make up for lost frames. A frame that opens a mode, or that must not be read behind another
@@ -73,7 +73,7 @@ class Pacing:
     def reset(self) -> None:
         """Forget everything, because the link is new."""
         self._written_at = float("-inf")
-        self._framed_at = float("-inf")  # the same, of the last frame that is not a lone `#`
+        self._framed_at = float("-inf")  # when the last frame that is not a lone `#` was written
         self._block_s = 0.0
         self._sure_block_s = 0.0  # 0 if the block is only possible
         self._earlier_block_s = 0.0  # the longest block of the frames that may have been unread at the last write

@@ -173,7 +173,7 @@ class StopExecutor:
     # ------------------------------------------------------------------ tries
 
     def settle(self, running: StopInProgress, now: float) -> None:
-        """End the stop if no reading has followed its last block gap too early, which shows it."""
+        """End the stop as shown, if no reading has followed its last block gap too early."""
         if self.model.evidence.settle(now):
             self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
 
@@ -198,7 +198,7 @@ class StopExecutor:
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
-        """Return the case as which the stop ends without evidence, or None if the car may still show it."""
+        """Return the case that ends the stop as sent, without evidence. None if the car may still show it."""
         if running.at_rest or self.model.trust.state is CarTrust.UNHEARD:
             return None
         facts = self._facts(running, now)
@@ -371,7 +371,7 @@ class StopExecutor:
             self._try_again(running, now)
             if running.sequence.is_recovery:
                 # The car may report by a timer although frames block it. Then the block of the last frame may not be
-                # over. A `#` that arrives before its end would be read as one string with the `MODE00` after it.
+                # over. The car would read a `#` that arrives before its end as one string with the `MODE00` after it.
                 running.try_at = max(now, self.model.pacing.flight_until + FLIGHT_S)
 
     def _finish(

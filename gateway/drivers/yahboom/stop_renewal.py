@@ -59,7 +59,7 @@ class StopRenewal:
 
     @property
     def goes_first_at(self) -> float:
-        """Return from when on a stream of actions must let the next frame of a renewal go first; inf if never."""
+        """Return when the next frame of a renewal goes before a stream of actions; inf if never."""
         follows_at = self._cleared_at + REPEAT_INTERVAL_S
         return (follows_at if self._general_stop_follows else self._next_at) + HELD_UP_S
 

@@ -47,7 +47,7 @@ ALWAYS: Final = 5
 UNREACTED: Final = 4
 """Number of undisturbed blocking frames without a reaction after which a car counts as one that cannot show a stop."""
 REACTED: Final = 3
-"""Number of consecutive reactions that withdraw that finding."""
+"""Number of consecutive reactions that withdraw the finding that a car cannot show a stop."""
 MAX_LEARNED_S: Final = 10.0
 """Maximum interval or block: three times those of the slowest car. A longer gap comes from the link or our loop. If it
 became the rhythm, as the first interval does, each stop would wait that long for a report before it is sent again."""

@@ -85,12 +85,12 @@ class PlatformDetector:
     """Number of frames that show an option, by option."""
     _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
     _extra_options: set[str] = field(default_factory=set)
-    """Contradictions that only show an option which is not configured."""
+    """Contradictions that show no more than an option which is not configured."""
     _readings: int = 0
     _assumed_silent: bool = False
     """True if the option `no_readings` of the profile comes from the silence of this link."""
     _is_heard: bool = False
-    """True if readings have contradicted that option."""
+    """True if readings have contradicted the option `no_readings`."""
     _other_head: str = ""
     _other_head_frames: int = 0
     """The first word of the last sensors frames, if this profile has another one, and the number of these frames."""
@@ -171,7 +171,7 @@ class PlatformDetector:
         """Treat a raspberry_pi car that has sent nothing on this link as one that never sends readings.
 
         The reports of such a car never show a stop, so only texts depend on this. Return the contradiction, in words.
-        Return an empty text for any other car, because that may be in a silent mode.
+        Return an empty text for any other car, because it may be in a silent mode.
         """
         if self.profile.kind is not Platform.RASPBERRY_PI or not self.profile.has_readings:
             return ""
@@ -181,9 +181,9 @@ class PlatformDetector:
         return f"no readings, which {named} cars send. It is treated as {self.profile.name} until one arrives"
 
     def _count_reading(self) -> tuple[str, ...]:
-        """Count a reading of a car that counts as one without readings. The third one ends that.
+        """Count a reading of a car that is treated as one without readings. The third reading ends this treatment.
 
-        If the car counted as such only because of its silence, the first reading is enough.
+        If the only reason for it was the silence of the car, the first reading is enough.
         """
         self._signs[NO_READINGS] = self._signs.get(NO_READINGS, 0) + 1
         if not self._assumed_silent and self._signs[NO_READINGS] < EVIDENCE_FRAMES:
@@ -250,7 +250,8 @@ class PlatformDetector:
             self._options = _without_head(self._options) | {option}
             self._apply_evidence()
             return ()
-        # Only cars with this head send such frames, so the configured head is wrong. With it, no frame could be read.
+        # Only cars with this head send such frames, so the configured head is wrong. With that one, no reading could be
+        # decoded.
         named = self.profile.name
         self.profile = _profile_of(self.profile.kind, _without_head(self.profile.options) | {option})
         words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"

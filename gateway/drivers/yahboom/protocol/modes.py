@@ -18,7 +18,8 @@ class ModeRow:
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the
     longest block of one turn of the mode's own loop. `rate_hz` is the maximum number of sensors frames per second.
-    `measures` lists the measurements in a frame of this mode, even if only programs of others than the vendor print it.
+    `measures` lists the measurements in a frame of this mode, even if the vendor's program does not print it, but
+    others do.
     """
 
     digit: int

@@ -356,7 +356,7 @@ class Profile:
         return (not left, not right) if self.modes_of_frame(event, mode) == (Mode.FOLLOWING,) else (left, right)
 
     def contradictions(self, event: Sensors) -> tuple[str, ...]:
-        """Return the contradictions between this frame and the platform, in words. None found proves nothing."""
+        """Return the contradictions between this frame and the platform, in words. An empty result proves nothing."""
         if self.kind is Platform.UNKNOWN:
             return ()
         candidates = candidate_modes(event)
@@ -416,7 +416,7 @@ _HINTS: Final = {
     "PV": "A battery of three cells is named by +3s, as in `platform: arduino+3s`.",
     "GS": "Over 1023 it is a converter of 12 bits: `platform: stm32`?",
 }
-"""By finding of `fleet doctor`, or by the field whose values are always out of range."""
+"""The hints, by finding of `fleet doctor` or by field whose values are always out of range."""
 
 # docs/reference/protocol.md#platforms
 _EVERY_CAR: Final = frozenset({"drive", "whistle", "speed", "servo", "fan", "light"})

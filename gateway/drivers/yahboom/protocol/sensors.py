@@ -127,7 +127,8 @@ class Sensors(NamedTuple):
     terminated: bool = True
     """True if the frame ends with `#`."""
     by_silence: bool = False
-    """True if there is no `#`, but no other byte either for 50 ms or until the link ended. The `#` may still come."""
+    """True if the frame has no `#`, and no byte came after it for 50 ms or until the link ended. The `#` may still
+    come."""
 
 
 # `read_sensors` reads the fields one by one, because a loop over the table would take 1.5 us more per frame: a third of

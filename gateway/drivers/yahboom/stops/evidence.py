@@ -6,9 +6,9 @@ general stop ends a motion of mode 0, and other modes ignore it. `MODE00` brakes
 
 *Why block gaps.* On most cars `MODE00` makes the program beep, which blocks it for about a second. Meanwhile the car
 sends nothing, so the next report comes later by just that second. This delay is the acknowledgement that the protocol
-lacks. The general stop does not block, so no reading ever shows it. That is why a stop that is to be shown ends with a
-lone `MODE00`, and why no other frame of ours may follow it: the link could turn a general stop that is written after
-the evidence into a motion, and no evidence would judge that frame. The frame that is judged must be the last one.
+lacks. The general stop does not block, so no reading ever shows it. So a stop that is to be shown ends with a lone
+`MODE00`, and no other frame of ours may follow it. If a general stop followed, the link could turn it into a motion,
+and no evidence would judge it. The frame that is judged must be the last one.
 
 *Why not one number.* How often a car reports, and for how long `MODE00` blocks it, are properties of its program
 (docs/reference/protocol.md#programs-that-people-have). Reports come every 0.7 s from one car and every 2.2 s from
@@ -27,13 +27,13 @@ each other.
 either, each `MODE00` seems to make a block gap, for ever. Often the length of the interval shows whether a report was
 lost or the car was blocked. But if the block is about a whole number of intervals, it does not. Then the gateway writes
 a general stop a third of an interval after a report. This frame does not block, so the next report must come on time.
-Suppose that the link made the block gaps, because it is mute after each write until the report after `MODE00` is lost.
-Then it is mute for as long after the general stop, so it loses this report, too, however much the intervals differ. So
-if the report is missing or damaged, the link made the block gaps.
+Suppose that the link made the block gaps: after each write it is mute for so long that it loses the next report. Then
+it is mute for as long after the general stop, and loses the report after that, too, however much the intervals differ.
+So if that report is missing or damaged, the link made the block gaps.
 
-*Why silence must follow.* A link that holds reports makes intervals of any length. But the held report comes late, and
-the next one on time, so the interval after that is too short. Therefore the last block gap counts only after the time
-in which such a report would have come.
+*Why silence must follow.* A link that holds reports makes intervals of any length. But only the held report comes late.
+The next one comes on time, so the interval between the two is too short. Therefore the last block gap counts only after
+the time in which that next report would have come.
 
 *Modes.* If a car reports in a mode, the form of its next report shows that it left the mode. On a car that was seen to
 block, one report is enough, if it comes at the right time. It must not come too early: the car must have begun it after
@@ -42,7 +42,7 @@ motors on, and that blocks it for longer. The silence of a silent mode shows not
 before the mode was opened, the end of the silence shows that it left the mode.
 
 *Damaged reports.* Reports have no checksum. A damaged frame of another mode can look like one of mode 0, so a report
-counts only after a silence that no such mode has. The start of one frame and the end of another can be joined. So the
+counts only after a silence that no other mode has. The start of one frame and the end of another can be joined. So the
 decoder ends a frame at a silence, and damage of any kind ends the comparison of intervals.
 
 *What is still doubtful.* A link that flips bits could turn the judged `MODE00` into another frame that blocks as long,
@@ -63,8 +63,9 @@ from schemas.words import Blocking, Mode, Shows
 
 MIN_SILENCE_SHARE: Final = 0.6
 MIN_SILENCE_S: Final = 0.8
-"""Minimum silence before a report of mode 0, so that it counts: this share of the interval, at most this time. In other
-modes the car sends 20 frames a second, so a damaged frame that looks like mode 0 has no such silence before it."""
+"""A report of mode 0 counts only after a silence of this share of the interval, or of this time if that is shorter. In
+other modes the car sends 20 frames a second, so a damaged frame that looks like mode 0 has no such silence before
+it."""
 FASTEST_S: Final = 0.3
 """Interval of the fastest car. It is used until the interval of this car is known."""
 BUNCHED_SHARE: Final = 0.3
@@ -108,7 +109,7 @@ class Finding(StrEnum):
     REPORT = "report"
     """A report of mode 0 whose sonar heard an echo. No `MODE00` is waiting for it, so one could be judged now."""
     UNJUDGED = "unjudged"
-    """The same, but the rhythm of the car is not known, so a `MODE00` could not be judged now."""
+    """A report like `REPORT`, but the rhythm of the car is not known, so a `MODE00` could not be judged now."""
     BLOCK_GAP = "block_gap"
     """A block gap. More are needed."""
     CONTROL = "control"
@@ -153,7 +154,7 @@ class StopEvidence:
     without_echo: int = 0
     """Number of consecutive reports without an echo."""
     changed_expectation: bool = False
-    """True if, by the last reading, this car cannot show a stop after all, or has another rhythm than before."""
+    """True if the last reading showed that this car cannot show a stop after all, or has another rhythm than before."""
     _last_at: float = _NEVER
     """When the last bytes arrived, except text and frames of the options (arm, gyro)."""
     _foreign_at: float = _NEVER
@@ -161,11 +162,11 @@ class StopEvidence:
     _echo_report_at: float | None = None
     """When the last report with an echo arrived. None if anything else has arrived since."""
     _no_echo_report_at: float | None = None
-    """The same for the last report without an echo."""
+    """When the last report without an echo arrived. None if anything else has arrived since."""
     _mode_00_at: float | None = None
     """When the last `MODE00` was written. None if it has a result, or will not be judged."""
     _first_delay_s: float | None = None
-    """The delay of the first report after that `MODE00`. None if it is not known."""
+    """The delay of the first report after the `MODE00` that waits for a result. None if it is not known."""
     _delayed: int = 0
     """Number of this stop's `MODE00` frames after which the first report was late, but not by the block."""
     _block_gaps: int = 0
@@ -193,9 +194,10 @@ class StopEvidence:
     _opened_at: float = _NEVER
     """When the last mode was opened."""
     _closed_at: float | None = None
-    """When the first `MODE00` since then was written, or None if none was."""
+    """When the first `MODE00` after the opening of the mode was written, or None if none was."""
     _closed_alone: bool = False
-    """True if no frame was written between the opening of the mode and that `MODE00`, nor a second `MODE00` since."""
+    """True if no frame was written between the opening of the mode and that `MODE00`, and no second `MODE00` after
+    it."""
 
     # ------------------------------------------------------------------ the car's own numbers
 
@@ -215,7 +217,7 @@ class StopEvidence:
 
     @property
     def min_silence_s(self) -> float:
-        """Return the minimum silence before a report of mode 0, so that it counts."""
+        """Return the minimum silence after which a report of mode 0 counts, s."""
         return min(MIN_SILENCE_S, MIN_SILENCE_SHARE * self.learned.interval_s(FASTEST_S))
 
     @property
@@ -231,7 +233,7 @@ class StopEvidence:
 
     @property
     def settling_s(self) -> float:
-        """Return the time to wait after the last block gap. If the link had held its report, the next comes earlier."""
+        """Return the wait after the last block gap, s. If the link held a report, the next one comes within it."""
         return max(0.0, self.interval_s - self.close_s) + SETTLING_S
 
     # ------------------------------------------------------------------ frames
@@ -275,7 +277,7 @@ class StopEvidence:
             self._closed_alone = False
 
     def on_block(self, kind: Blocking | None, block_s: float, now: float) -> None:
-        """Record a frame other than `MODE00`, if it blocks the car, for at most `block_s`, and so delays a report."""
+        """Record a frame other than `MODE00`, if it blocks the car, `block_s` at most, and so delays a report."""
         if block_s > FRAME_S:
             self._blocks.append(_Block(kind, block_s, now))
 

@@ -57,12 +57,12 @@ FULL: Final = StopSequence(
     "full", 2, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=REPEAT_INTERVAL_S))
 )
 
-# The same for a car in another mode than 0, where it ignores a general stop.
+# FULL for a car in another mode than 0, where it ignores a general stop.
 FULL_MODE: Final = StopSequence(
     "full_mode", 2, (Step(_MANUAL, Gate.ALONE), Step(STOP_FRAME, Gate.FLIGHT, after_s=JUDGED_S))
 )
 
-# The same if a frame of ours may be unread. Behind that frame the car would misread `MODE00`, so `MODE00` waits. The
+# FULL if a frame of ours may be unread. Behind that frame the car would misread `MODE00`, so `MODE00` waits. The
 # general stop does not wait: behind an unread frame it is lost without harm, and usually there is no such frame.
 FULL_BEHIND: Final = StopSequence("full_behind", 2, (Step(STOP_FRAME, Gate.FLIGHT), Step(_MANUAL, Gate.ALONE)))
 
@@ -100,8 +100,8 @@ BOTH: Final = StopSequence(
     ),
 )
 
-# The same if mode 0 is certain. Then general stops stop every platform, even behind an unread frame of ours. `MODE00`
-# comes later and alone: in one string with a stop it would undo the stop, and with a servo frame it would open a mode.
+# BOTH if mode 0 is certain. Then general stops stop every platform, even behind an unread frame of ours. `MODE00` comes
+# later and alone: in one string with a stop it would undo the stop, and with a servo frame it would open a mode.
 BOTH_MANUAL: Final = StopSequence(
     "both_manual",
     3,

@@ -103,7 +103,7 @@ class StopContext:
 
     @property
     def turn_s(self) -> float:
-        """Return the longest turn of the mode's loop, which reads nothing meanwhile; of the slowest mode if unknown."""
+        """Return the longest turn of the mode's loop, which reads nothing meanwhile, or that of the slowest mode."""
         known = self.mode is not None and not self.contradicted
         return self.profile.mode_turn_s(self.mode if known and self.mode is not None else Mode.OBSTACLE_AVOIDANCE)
 
@@ -132,7 +132,7 @@ class StopInProgress:
     """When the newest `MODE00` was written."""
     tries: int = 1
     worst_at: float = float("-inf")
-    """The latest time at which the motors are off, if all steps are in time and all frames arrive."""
+    """The time by which the motors are off, if all steps are in time and all frames arrive."""
     timeout_s: float = EVIDENCE_TIMEOUT_S
     """Timeout for the evidence, from the arrival of each command."""
     report_wait_s: float = 0.0
@@ -142,7 +142,8 @@ class StopInProgress:
     report_at: float = float("-inf")
     """Arrival of the last report of mode 0 that the car sent after the newest `MODE00`."""
     no_echo_at: float = float("-inf")
-    """Arrival of the last such report without an echo. A single one may be corrupted, so two are needed."""
+    """Arrival of the last report without an echo that the car sent after the newest `MODE00`. A single one may be
+    corrupted, so two are needed."""
     without_echo: int = 0
     """Number of reports without an echo since the stop began."""
     probes: int = 0
@@ -184,7 +185,7 @@ class StopInProgress:
 
     @property
     def obeys_by(self) -> float:
-        """Return the latest time at which the car has obeyed, if the frames arrived."""
+        """Return the time by which the car has obeyed, if the frames arrived."""
         return max(self.last_at, self.worst_at)
 
     @property
@@ -220,8 +221,8 @@ class StopInProgress:
     def gives_way_at(self) -> float:
         """Return when a new command may replace the repeats; inf if the first frames are not all written.
 
-        Missing evidence delays no single command. The first frames delay it until the announced worst case is over, or
-        until a report shows that the car is in mode 0 and reads frames.
+        A single command does not wait for evidence. It waits for the first frames, until the announced worst case is
+        over, or until a report shows that the car is in mode 0 and reads frames.
         """
         if self.repeats:
             return self.began_at
