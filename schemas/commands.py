@@ -46,7 +46,7 @@ class CommandType:
     max_duration_s: float = 0.0
     """Maximum of its field `duration_s`. 0 if it has none, or if each gateway has a limit of its own."""
     min_duration_s: float = 0.0
-    """Minimum of that field. 0 if any duration above 0 is allowed."""
+    """Minimum of the field `duration_s`. 0 if any duration above 0 is allowed."""
     signal: bool = False
     """True if the car only gives a signal, such as the whistle. The verb and `duration_s` describe it fully, so control
     needs no class for it."""

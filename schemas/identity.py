@@ -119,7 +119,7 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
 
 
 def may_locate(identity: str, of: str) -> bool:
-    """Return True if an identity may publish the pose of this car: its own gateway, and a locator.
+    """Return True if an identity may publish the pose of this car. The car's own gateway and a locator may.
 
     `identity` is empty on a hub without certificates, where everyone may.
     """

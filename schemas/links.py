@@ -42,7 +42,7 @@ class BadLink(ValueError):
 
 
 class Look(Protocol):
-    """Looks for the device or host of a link, and opens no link. Each returns True if all is well, and a text."""
+    """Looks for the device or host of a link. Opens no link. Each method returns True if all is well, and a text."""
 
     def device(self, path: str) -> tuple[bool, str]:
         """Look at a serial port."""
@@ -273,7 +273,7 @@ class BleUrl(LinkUrl):
     @classmethod
     def parse(cls, text: str) -> LinkUrl | None:
         """Return the link with this URL. Raises BadLink if a part is wrong."""
-        # Not by urlsplit, which would take the colons of an address for a port.
+        # `urlsplit` would take the colons of an address for a port.
         return _ble(text[6:]) if text[3:6] == "://" else None
 
     @classmethod

@@ -140,7 +140,7 @@ class People:
     def may_direct(self, sender: Sender) -> "Denial | None":
         """Return why this sender may not act on the whole fleet: pause it, lend a car, change its plan.
 
-        Where there are leads, only they may; elsewhere every person of the fleet.
+        Where there are leads, only they may. Elsewhere every person of the fleet may.
         """
         if sender.kind is Rank.LEAD:
             return None
@@ -168,7 +168,7 @@ def _parse(entry: str) -> tuple[str, PersonRole]:
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Keeps the coordinator from moving a stopped car; after the stop of a lead also persons and scripts.
+    """Keeps the coordinator from moving a stopped car. The hold of a lead also keeps persons and scripts from it.
 
     `since_ns` is in ns since the epoch.
     """

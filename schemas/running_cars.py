@@ -13,13 +13,13 @@ _SUFFIX: Final = ".running"
 
 
 class RunningMark:
-    """The mark of one gateway: a lock, which goes with the process in any case. `directory`: the state of its bus."""
+    """The mark of one gateway: a lock that ends with its process, even if killed. `directory`: the state of its bus."""
 
     def __init__(self, directory: Path, fleet: str, car: str) -> None:
         self._lock = FileLock(directory / f"{fleet}.{car}{_SUFFIX}")
 
     def renew(self) -> None:
-        """Set the mark if it is not set. Call it regularly: a program that looks for marks locks each for a moment."""
+        """Set the mark if it is not set. Call it regularly: a program that looks for marks locks all for a moment."""
         with suppress(OSError):  # a full disk, or a place without locks: the gateway runs all the same
             self._lock.try_take()
 

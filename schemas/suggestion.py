@@ -9,7 +9,8 @@ from collections.abc import Iterable
 from typing import Final
 
 _LETTERS_PER_FAULT: Final = 3
-"""For every three letters of a word, one may be wrong, missing, extra or swapped; in a shorter word, one may be too."""
+"""For every three letters of a word, one letter may be wrong, missing, extra or swapped. In a shorter word, one may
+be."""
 _MIN_PART_LENGTH: Final = 3
 """Minimum length of a word that is looked for at the beginning of parts of names."""
 _NO_WORD: Final = re.compile(r"[^a-z0-9]+")

@@ -72,8 +72,9 @@ class Topic:
         return max(_MIN_CACHE_SIZE, math.ceil(CACHE_S * self.rate_hz))
 
 
-# A mode-0 report comes about once a second and may be blocked for another (docs/reference/protocol.md#blocking-times),
-# so a reading is stale after 3 s; states are published on change and once a second.
+# A mode-0 report comes about once a second and may be blocked for another second
+# (docs/reference/protocol.md#blocking-times), so a reading is stale after 3 s; states are published on change and once
+# a second.
 _READING: Final = 3.0
 _STATE: Final = 3.0
 _TRACKING_HZ: Final = 27.0  # docs/reference/protocol.md#rates: the most frames the UART carries, in tracking

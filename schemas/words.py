@@ -288,7 +288,7 @@ class Shows(StrEnum):
 
     UNKNOWN = "not_known_yet"
     YES = "yes"
-    """The car has shown one."""
+    """The car has shown a stop."""
     NO = "no"
     """The reports of the car do not react to frames."""
 

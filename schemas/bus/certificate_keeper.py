@@ -18,13 +18,15 @@ CHECK_INTERVAL: Final = timedelta(minutes=10)
 """Interval at which a program looks at its certificate, and at which it repeats a failed renewal."""
 SHORTEST_CHECK_INTERVAL: Final = timedelta(seconds=1)
 SHARE_OF_A_CHECK: Final = 0.1
-"""CHECK_INTERVAL as a share of the time that the certificate has left. The shorter of the two intervals counts."""
+"""Interval of the checks as a share of the time that the certificate has left, if that is shorter than
+CHECK_INTERVAL."""
 WARNED_SHARE: Final = 0.1
 """Share of a certificate's life that is left when a program warns that nobody has renewed it."""
 RENEWAL_QUERY_TIMEOUT_S: Final = 10.0
 """Timeout of a request to the hub, which starts a process to sign the certificate."""
 REOPEN_DELAY_S: Final = 5.0
-"""Time until a session uses the new certificate. Most commands have ended by then, and need not reopen theirs."""
+"""Time until a session uses the new certificate. Most commands have ended by then, and need not reopen their
+session."""
 
 
 class CertificateKeeper(threading.Thread):

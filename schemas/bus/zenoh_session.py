@@ -48,9 +48,9 @@ _THREAD_END_TIMEOUT_S: Final = 2.0
 _DECLARE_LOCK: Final = threading.Lock()
 
 OVERLAP_S: Final = 0.5
-"""Time during which the first and the second session are both used when `reopen` replaces one by the other: until then,
-also the hubs of other sites know the second one. Then the first one is used for the same time again, for messages that
-are still on their way."""
+"""Time for which both sessions are used when `reopen` replaces the first by the second. After it, the hubs of other
+sites know the second one, too. Then the first one is used for the same time again, for messages that are still on their
+way."""
 ANSWERS_S: Final = 12.0
 """Time for which the first session stays open for late answers. No query waits for longer than 10 s."""
 REOPEN_TIMEOUT_S: Final = 5.0
@@ -98,8 +98,9 @@ class Bus:
     ) -> Self:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
-        With `start_hub`, start a hub if there is none. Without, raise NoFleet if there is no hub on this computer, and
-        HubUnreachable if there is none on another computer.
+        With `start_hub`, start a hub if there is none. Without it, raise NoFleet if there is no hub on this computer,
+        or HubUnreachable if the endpoint is on another computer and no hub answers there.
+
         `identity` is the owner of the certificate to use, such as `car.red`; by default it is the user. It matters only
         to a hub with certificates. Raises NoCredentials if this computer has no such certificate.
         """
@@ -377,9 +378,9 @@ class Bus:
 
         A link that was lost is awaited for up to 2 s, unless the session watches this expression.
         """
-        # Zenoh answers a session without a link at once, as if there were no tokens. And it leaves out of an answer
-        # what is on its way to a watch of the session, right after the watch was declared or a new link was opened. So
-        # a session with watches asks twice over each new link: the second answer comes behind those tokens.
+        # Zenoh answers a session without a link at once, as if there were no tokens. And right after a watch was
+        # declared or a new link was opened, it leaves out of an answer the tokens that are on their way to that watch.
+        # So a session with watches asks twice over each new link: the second answer comes behind those tokens.
         wanted, end = zenoh.KeyExpr(expression), monotonic() + timeout_s
         link_end = min(end, monotonic() + _LINK_TIMEOUT_S)
         while True:

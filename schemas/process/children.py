@@ -10,7 +10,7 @@ if TYPE_CHECKING:  # most processes have no loop
     from asyncio.subprocess import Process
 
 OWN_GROUP: Final = 0 if os.name == "posix" else None
-"""The `process_group` of a child that we end in order: Ctrl-C at the terminal reaches only us."""
+"""The `process_group` of a child that we end ourselves: Ctrl-C at the terminal then reaches only us."""
 
 
 def start_detached(command: Sequence[str], *, output: int | IO[Any] = subprocess.DEVNULL) -> "subprocess.Popen[str]":
@@ -35,7 +35,7 @@ def leave(process: "subprocess.Popen[Any]") -> None:
 
 
 def wait(process: "subprocess.Popen[Any]", timeout_s: float | None) -> int | None:
-    """Wait until a process has ended, without a timeout for ever. Return its exit code, or None if it still runs."""
+    """Wait until a process has ended, for ever without a timeout. Return its exit code, or None if it still runs."""
     try:
         return process.wait(timeout_s)
     except subprocess.TimeoutExpired:

@@ -10,7 +10,7 @@ import threading
 from typing import Final, Self
 
 MESSAGE: Final = b"panicked at"
-"""Part of every such message (Rust's standard panic hook)."""
+"""Part of every message of a panic (Rust's standard panic hook)."""
 _MAX_READ_BYTES: Final = 65_536
 
 

@@ -20,7 +20,8 @@ Where = tuple[str | int, ...]
 _MAX_VALUE_LENGTH: Final = 60
 _MAX_WORDS_LISTED: Final = 12
 _ITEMS: Final = {"boxes": "box", "capabilities": "capability", "line": "point", "path": "point", "then": "effect"}
-"""How an item of a list is called, by the name of the list. For other lists: the name of the list without its s."""
+"""What an item of a list is called, by the name of the list. In other lists, it is the name of the list without its
+s."""
 _TYPES: Final = {
     "string": "text",
     "integer": "a whole number",
