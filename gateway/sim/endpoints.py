@@ -249,7 +249,7 @@ class TcpEndpoint(SimEndpoint):
         return f"tcp://[{self._host}]:{self._port}" if ":" in self._host else f"tcp://{self._host}:{self._port}"
 
     async def up(self) -> None:
-        """Listen. After the first time, this uses the port of the first time again."""
+        """Listen. From the second time on, use the port of the first time again."""
         if self._server is not None:
             return
         loop = asyncio.get_running_loop()

@@ -101,7 +101,7 @@ class SimCar:
 
     @property
     def lost_bytes(self) -> dict[str, int]:
-        """Bytes lost to faults of the link, to the car and to the host."""
+        """The number of bytes that faults of the link have lost, on the way to the car and to the host."""
         return {way.value: count for way, count in self._faults.lost_bytes.items()}
 
     @property

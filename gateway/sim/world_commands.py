@@ -11,7 +11,7 @@ from gateway.sim.model.world import World
 Change = Callable[[World, float], None]
 """Changes a world. The second argument is the time of the change."""
 WorldState = Mapping[str, Mapping[str, Mapping[str, Any]]]
-"""Under `lamps` and `things`, for each name its fields."""
+"""The fields of each lamp and thing by its name, under `lamps` and `things`."""
 
 _Kind = TypeVar("_Kind", Lamp, MovingObject)
 _PLACE: Final = {"x_m": (-FAR_M, FAR_M), "y_m": (-FAR_M, FAR_M)}

@@ -17,7 +17,8 @@ SONAR_REACH_CM: Final = 499.0
 """Just below 500 cm: the car's own program discards a reading of 500 cm or more."""
 SONAR_CONE: Final = tuple(radians(degree) for degree in (-15.0, -7.5, 0.0, 7.5, 15.0))
 SONAR_STEEPEST: Final = cos(radians(76))
-"""Cosine of the largest angle to a surface's normal with an echo. At a larger one, the sound is reflected away."""
+"""Cosine of the largest angle to a surface's normal at which there is an echo. At a larger angle, the sound is
+reflected away."""
 INFRARED_REACH_M: Final = 0.20
 INFRARED_SIDE: Final = radians(20)
 # For cars and things. A wall is detected only in the middle of the cone, so that recorded avoidance runs do not change.

@@ -28,7 +28,7 @@ def build(
 ) -> Firmware:
     """Return car number `index` of the world, at rest on its start pose, with its program just started.
 
-    The world file may give a start pose and things to carry to the car with this `name`. Only a Raspberry Pi uses
+    In the world file, the car with this `name` may have a start pose and things to carry. Only a Raspberry Pi uses
     `transport`, because an Arduino behind a Wi-Fi bridge still has its UART. If `traits` is None, the car has those of
     its platform. The course's program has no traits.
     """

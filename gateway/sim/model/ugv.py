@@ -199,7 +199,7 @@ class UgvCar:
         self._reset(now, text=True)
 
     def press(self, button: Button, now: float) -> bool:
-        """Press a button of the car's own web page; return True if the page has it.
+        """Press a button of the car's own web page; return True if the page has that button.
 
         The page repeats the command until the next button or a reset.
         """
@@ -512,7 +512,7 @@ class UgvCar:
             yaw = round(degrees(self._body.pose(now).heading_rad), 2)
             fields = {"T": 1001, **wheels, "r": 0.4, "p": -0.2, "y": yaw, "temp": 41.5, "v": round(volts, 2)}
         if self._module == 1:
-            # A real car sends such a name twice, at last with the position of the arm. The last value counts.
+            # A real car sends such a name twice, the second time with the position of the arm. The last value counts.
             places = [f"a{each}" for each in "xyz"] if self._build.is_ros else list("xyz")
             fields |= dict(zip(places, (310.2, -194.1, 228.6), strict=True)) | {"torB": -56, "torS": 12}
         elif self._module == 2:

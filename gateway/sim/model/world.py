@@ -36,9 +36,9 @@ _PUSH_ROUNDS: Final = 3
 """Maximum number of rounds in which a car is pushed out of each obstacle in turn."""
 _TOLERANCE_M: Final = 1e-9
 _START_GRID_M: Final = 0.4
-"""Distance of the start places of cars that have none in the world file."""
+"""Distance between the start places that the world chooses for cars without one in the world file."""
 _START_REACH_M: Final = 4.0
-"""Maximum distance of these start places from the middle if there are no walls."""
+"""Maximum distance from the middle of a start place that the world chooses, if there are no walls."""
 
 
 class WorldBody(Protocol):
@@ -172,7 +172,8 @@ class World:
     def ray(self, x: float, y: float, angle: float, steepest: float = 0.0) -> float | None:
         """Return the distance to the first wall, or None.
 
-        Only a wall reflects at which the cosine of the angle to its normal is at least `steepest`.
+        A wall reflects only if the cosine of the angle between the ray and the normal of the wall is at least
+        `steepest`.
         """
         best = self._wall(x, y, cos(angle), sin(angle))
         return None if best is None or best[1] < steepest else best[0]
