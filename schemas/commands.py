@@ -106,7 +106,7 @@ _ROWS: Final = (
     CommandType(Verb.UNPAUSE, "end the pause of the fleet; move nothing", "{words}", wildcard=True),
     CommandType(
         Verb.LEND,
-        "let only one person drive the car for `duration_s`, or `end` that",
+        "let only one person drive the car for `duration_s`; `end` ends the loan",
         "{words}",
         max_duration_s=86_400.0,
     ),
