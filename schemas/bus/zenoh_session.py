@@ -49,7 +49,7 @@ _DECLARE_LOCK: Final = threading.Lock()
 
 OVERLAP_S: Final = 0.5
 """Time for which both sessions are used when `reopen` replaces the first by the second. After it, the hubs of other
-sites know the second one, too. Then the first one is used for the same time again, for messages that are still on their
+sites know the second one, too. Then the first one is kept for the same time again, for messages that are still on their
 way."""
 ANSWERS_S: Final = 12.0
 """Time for which the first session stays open for late answers. No query waits for longer than 10 s."""
