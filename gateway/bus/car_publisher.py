@@ -47,7 +47,7 @@ _CLASSES: Final[dict[str, Any]] = {
 }
 """Message classes by topic. Each message is a new object, because a cleared one would not free its memory."""
 _ON_ARRIVAL: Final = frozenset({Phase.ASKED, Phase.QUEUED, Phase.REJECTED})
-"""Phases that are recorded when a command arrives, so without `took_s`."""
+"""Phases that are recorded when a command arrives. These records have no `took_s`."""
 
 
 class CarPublisher:

@@ -20,7 +20,8 @@ MAX_V: Final = 13.0
 """Maximum speed of a wheel, and maximum voltage of three cells. A greater number is not a measurement."""
 _IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 _OF_ARM: Final = frozenset({"torB", "torS", "torE", "torH"})
-"""Fields of a car with an arm. Such a car sends positions of the arm in the fields of the yaw or the acceleration."""
+"""Fields that only a car with an arm sends. Such a car sends positions of the arm in the fields of the yaw or the
+acceleration."""
 _DECODER: Final = json.JSONDecoder()
 
 

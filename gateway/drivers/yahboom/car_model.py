@@ -153,7 +153,7 @@ class CarModel:
 
     @property
     def shows_fan(self) -> bool:
-        """Return True if a reading shows that the fan is off.
+        """Return True if every reading of this car shows that its fan is off.
 
         A car that reports by a timer sends readings even with the fan on. A car that was only detected as an arduino
         may be such a car, until it has shown that its reports wait for its loop.

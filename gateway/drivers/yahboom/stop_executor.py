@@ -198,7 +198,7 @@ class StopExecutor:
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
-        """Return the case that ends the stop as sent, without evidence. None if the car may still show it."""
+        """Return the case with which the stop ends as sent. None if the car may still show it."""
         if running.at_rest or self.model.trust.state is CarTrust.UNHEARD:
             return None
         facts = self._facts(running, now)

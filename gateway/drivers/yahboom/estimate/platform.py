@@ -1,7 +1,8 @@
 """Detects from the car's bytes which program runs on it, and checks the bytes against the configured profile.
 
-Two differences cannot be seen in the bytes: an arduino and an stm32 usually send the same, and a car does not report
-its lights, such as light 1, which a raspberry_pi car cycles. A single frame may be corrupted, so three in a row count.
+Two differences cannot be seen in the bytes. An arduino and an stm32 usually send the same. And no car reports its
+lights, so the bytes do not show that light 1 of a raspberry_pi car changes its color each time. A single frame may be
+corrupted, so three in a row count.
 """
 
 from dataclasses import dataclass, field

@@ -11,7 +11,8 @@ from gateway.drivers.yahboom.protocol.modes import MODES
 
 # framing: UART 9600 8N1, so at most 960 bytes/s each way
 BYTES_PER_S: Final = 960
-# general frame with motion, light, speed only: 0, but allow 0.06 s; also the 60 ms between two writes (hazards)
+# A general frame with only motion, light and speed blocks for 0 s. 0.06 s is also the time between two writes
+# (hazards).
 FRAME_S: Final = 0.06
 WHISTLE_S: Final = 0.30  # whistle
 SERVO_S: Final = 0.65  # PTZ, front servo left/right/reset

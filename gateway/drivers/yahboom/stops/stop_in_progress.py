@@ -23,11 +23,12 @@ _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After that the command fails."""
 EVIDENCE_INTERVALS: Final = 5
-"""Minimum of that timeout, as a number of block gaps: three that may be needed (because one may be in doubt), one for
-the report before them, and one for the silence after them. The maximum of the timeout is `MAX_EVIDENCE_TIMEOUT_S`."""
+"""Minimum of the timeout for the evidence, as a number of block gaps: three that may be needed (because one may be in
+doubt), one for the report before them, and one for the silence after them. The maximum of the timeout is
+`MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
-"""Maximum of the worst case that is added to that timeout, so that nobody waits longer than 17 s for an answer, or 23 s
-with the slowest car."""
+"""Maximum of the worst case that is added to the timeout for the evidence, so that nobody waits longer than 17 s for an
+answer, or 23 s with the slowest car."""
 # The silence between two tries is longer than any block outside avoidance, so the car reads the next frame alone. With
 # an increase up to 6.5 s, the car reads at least one of two tries within 15 s after the end of a fault.
 RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
