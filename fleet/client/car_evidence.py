@@ -25,7 +25,7 @@ _EVENT = topics.TOPICS["event/command"]
 
 
 def collect(client: Fleet) -> dict[str, CarEvidence]:
-    """Return the evidence, by name, of every car that is on the bus, supervised, or served on this computer."""
+    """Return the evidence by car, for every car that is on the bus, supervised, or served on this computer."""
     present = client.cars()
     here = running_cars_of(client.bus.endpoint, client.name)
     supervisions = ask_status(client.bus, client.name)
@@ -68,7 +68,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
 
 
 def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
-    """Return the newest time of the states of each car, s since the epoch by its gateway's clock."""
+    """Return by car the stamp of its newest state, s since the epoch by its gateway's clock."""
     found: dict[str, float] = {}
     for reading in readings:
         key = keys.parse(reading.key)

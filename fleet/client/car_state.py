@@ -3,11 +3,11 @@
 Pure: time is an argument (s, of any one clock). Lists, status, doctor, console and the plan all look at a car through
 one `CarState`, so that they agree. `claims` puts it into words.
 
-**How old is a message?** Two clocks could measure this: our clock when the message came, or the gateway's clock when it
-stamped the message. The clocks of two computers differ by seconds. By its stamps, a car that publishes once a second
-could then look stale. So the age of a message that was published just now counts from when it came. An answer to a
-query is different. It may have waited in a gateway that hangs, or come from a replay, and only its stamp shows its age
-(`age_of_answer_s`). A stamp far ahead of our clock is from before a clock was set back. Such a message counts as stale.
+**How old is a message?** It could count from when the message came, by our clock, or from its stamp, by the gateway's
+clock. The clocks of two computers differ by seconds. By its stamps, a car that publishes once a second could then look
+stale. So the age of a message that was published just now counts from when it came. An answer to a query is different.
+It may have waited in a gateway that hangs, or come from a replay, and only its stamp shows its age (`age_of_answer_s`).
+A stamp far ahead of our clock is from before a clock was set back. Such a message counts as stale.
 
 **Does its gateway still run?** The states of a gateway that has ended no longer count. They are kept as its last words,
 since a person wants to know them, but `of` does not return them. They are forgotten as soon as another gateway of the
@@ -37,13 +37,13 @@ NEVER_HEARD: Final = "nothing was heard from it yet"
 _MAX_KNOWN_ENDED: Final = 8
 """Number of ended gateways of a car whose late messages are recognized."""
 LATE_MESSAGE_NS: Final = 2_000_000_000
-"""Maximum time by which a late message of an ended gateway is stamped after the last one that counted, ns."""
+"""Maximum time from the stamp of the last message that counted to that of a late message of an ended gateway, ns."""
 _UNHEARD_S: Final = 3.0
 """Silence after which a car counts as unheard if the state of its motors is unknown."""
 
 
 class GatewayStarts:
-    """Recognizes which messages are from the running gateway of a car.
+    """Recognizes the messages of the running gateway of a car.
 
     Each start of a gateway has a `boot_id`. A message of an earlier start may come late, through a cache or a slow
     reader. It must not bring back what that gateway claimed. Two gateways of a car may run for a moment, until one of
@@ -173,7 +173,7 @@ class CarState:
         return inf if found is None else max(0.0, now - found.at)
 
     def is_stale(self, topic: str, now: float) -> bool:
-        """Return True if the newest message should have been followed by another meanwhile."""
+        """Return True if another message should have followed the newest one by now."""
         after_s = topics.TOPICS[topic].stale_after_s
         return after_s is not None and self.age_s(topic, now) > after_s
 

@@ -1,9 +1,8 @@
 """Claims about a car's motors, mode and link, and their texts. Pure: time is an argument.
 
 A car acknowledges nothing, so each such statement is a claim. It has a basis (the car's own readings, or only the
-frames that were sent), a time since which it has been so, and an age: the time since its gateway published it. The
-claims of a gateway that has ended no longer count: its last claims are shown as past ones, with their age, and never as
-present ones.
+frames that were sent), a time since which it has been true, and an age: the time since its gateway published it. The
+last claims of a gateway that has ended are shown as past ones, with their age, and never as present ones.
 
 Lists, status, shutdown, doctor, console and Python all use these texts, so that a car is described everywhere alike.
 """

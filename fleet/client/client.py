@@ -62,7 +62,7 @@ _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
 """Poll interval of a wait without a timeout."""
 _MAX_STOP_THREADS: Final = 1024
-"""Maximum number of queries for stops that wait for answers at a time. A stop has two queries."""
+"""Maximum number of a stop's queries that wait for answers at the same time. A stop has two queries."""
 _MIN_QUERY_TIMEOUT_S: Final = 0.1
 """Minimum timeout of the query for the current values, even if the wait itself is shorter."""
 
@@ -145,10 +145,10 @@ class Fleet:
         """The publisher of each car's poses, by car."""
         self._pose_lock = threading.Lock()
         self._pool = ThreadPoolExecutor(max_workers=32, thread_name_prefix="fleet-ask")
-        # The query of a gateway that hangs occupies its thread for 10 s. A stop never waits for such a thread.
+        # A query to a gateway that hangs occupies a thread for 10 s. A stop never waits for such a thread.
         self._stop_pool = JobThreads(_MAX_STOP_THREADS, "fleet-stop")
         self.dropped = 0
-        """Number of dropped command events: the queue of their command was full."""
+        """Number of command events that were dropped because the queue of their command was full."""
         try:
             self.bus.token(token)
             self.bus.subscribe(keys.topic_key(self.name, "*", "event/command"), self._on_event)

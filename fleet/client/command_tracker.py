@@ -21,7 +21,7 @@ WAIT_SAID_S: Final = 1.0
 SEND_AGAIN_INTERVAL_S: Final = 0.5
 """Interval at which a stop without an answer is sent again. A lost session tries to connect again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
-"""Interval of looking whether the bus is there while a stop has no answer. A session is lost for at least twice as
+"""Interval of the checks whether the bus is there, while a stop has no answer. A session is lost for at least twice as
 long."""
 _MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of up to some hundred cars
 
@@ -46,7 +46,7 @@ class PresenceChange:
 
 
 class SupervisedCars:
-    """The cars whose gateways a supervisor runs (none without a supervisor), and the cars on the bus at that time."""
+    """The cars whose gateways a supervisor runs (none without one), and the cars that were then on the bus."""
 
     def __init__(self, names: frozenset[str], present: frozenset[str]) -> None:
         self.names = names
@@ -64,11 +64,10 @@ class PendingCommand:
 
     # A stop must not miss a car whose gateway hangs: after 2 s its token is gone, and a wildcard query no longer
     # reaches it. Therefore a stop is also for the cars that a supervisor knows, and is sent again to their new
-    # gateways.
-    # Nor must a stop be lost with the bus: a hub that hangs accepts the query, and drops it when its links are cut
-    # after Zenoh's lease. So a stop that a gateway has not answered is sent again when the bus is back, as long as
-    # gateways accept a stop of that age (STOP_TTL_S). A car that has answered does not get the stop again, because a
-    # person may have released the car meanwhile.
+    # gateways. A stop could also be lost with the bus: a hub that hangs accepts the query, and drops it when Zenoh's
+    # lease ends and cuts its links. So a stop that a gateway has not answered is sent again when the bus is back, as
+    # long as gateways accept a stop of that age (STOP_TTL_S). A car that has answered does not get the stop again,
+    # because a person may have released the car meanwhile.
 
     def __init__(
         self,

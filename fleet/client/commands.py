@@ -157,7 +157,7 @@ def pause_request(why: str = "") -> CommandRequest:
 
 
 def lend_request(to: str, duration_s: float) -> CommandRequest:
-    """Request a loan of the car for `duration_s`: only this person, that person's scripts, and leads may drive it."""
+    """Request a loan of the car for `duration_s`: only that person, their scripts, and leads may drive it."""
     return CommandRequest(Verb.LEND, pb.LendCommand(to=keys.check_name(to, "person"), duration_s=duration_s))
 
 

@@ -120,5 +120,5 @@ def _check_with_all_fields(
     aliases: dict[str, str] = {}
     for message, each in fields_of_message.items():
         aliases |= topic_aliases_of(topic_names[message], each)
-    # The error lists the names in this order. So fields that every message has come last.
+    # The error lists the names in this order, so put the fields of every message last.
     parse(text, {name: fields[name] for name in sorted(fields, key=LAST.__contains__)}, aliases)

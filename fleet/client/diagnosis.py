@@ -1,4 +1,4 @@
-"""Finds the likely causes of a car that behaves oddly, and the facts behind them. Pure.
+"""Finds out why a car behaves oddly: the likely causes, and the facts behind them. Pure.
 
 `CHECKS` is the table of findings. Each has a code, a function that finds the cause, and a command to type. The
 likeliest cause comes first.
@@ -75,8 +75,8 @@ class CarEvidence:
     runs_here: bool = False
     """True if a gateway of the car runs on this computer, on the bus or not."""
     asked: bool = False
-    """True if the states are answers to a query. Then something answers for the car, even if the states are old, as
-    those of a replay."""
+    """True if the states are answers to a query. So something answers for the car, even if the states are old, as in a
+    replay."""
 
     @property
     def failed(self) -> list[tuple[float, Any]]:
@@ -110,7 +110,7 @@ class DoctorFinding:
 
 @dataclass(frozen=True, slots=True)
 class DoctorCheck:
-    """One row of the table. `cause` returns words about the cause, empty if the condition is not met."""
+    """One row of the table. `cause` returns the cause in words, empty if the check finds nothing."""
 
     code: str
     cause: Callable[[CarEvidence], str]
@@ -304,7 +304,7 @@ def _refused(e: CarEvidence) -> str:
         return ""
     age, event = e.failed[-1]
     is_over = event.reason == Reason.WRONG_MODE and e.state.mode.asked == Mode.MANUAL
-    # It is also over if the car has carried out such a command since then.
+    # The refusal is also over if the car has carried out such a command since then.
     if is_over or any(each.verb == event.verb and each.phase in _CARRIED_OUT for at, each in e.commands if at < age):
         return ""
     return f"{name_of(event.sender)}'s {event.verb} was not carried out {age:.0f} s ago: {_why(event)}."
@@ -374,7 +374,7 @@ def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
         if (cause := check.cause(evidence))
     ]
     last = evidence.failed[-1][1].reason if evidence.failed else ""
-    # If another finding has the code of the last refusal, it explains the refusal: do not list that as well.
+    # If another finding has the code of the last refusal, that finding explains it: do not list the refusal, too.
     known = any(each.code == last for each in found)
     return [each for each in found if not (known and each.code == "refused")]
 
@@ -411,7 +411,7 @@ def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
 
 
 def doubtful(evidence: CarEvidence) -> set[str]:
-    """Return the names of the facts of `describe` that the car has not shown, and that may be wrong."""
+    """Return the names of the facts of `describe` that may be wrong, because the car has not shown them."""
     state = evidence.state
     if not state.present:
         return set(state.claims(evidence.now).by_name)

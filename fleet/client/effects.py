@@ -11,7 +11,7 @@ UNCONFIRMED: Final = "unconfirmed"
 """The result of a stop or a drive whose basis is `sent`."""
 RELEASE: Final = "release"
 ESTOP_FLEET: Final = "estop_fleet"
-"""Verbs that exist only in this module: a drive with motion stop, and an e-stop of all cars."""
+"""Verbs that exist only in this module: for a drive with motion stop, and for an e-stop of all cars."""
 _ESTOP: Final[dict[str, str]] = {
     Basis.SHOWN: "emergency-stopped ({took_s:.1f} s)",
     Phase.COMPLETE: "emergency-stopped ({took_s:.1f} s)",

@@ -3,8 +3,7 @@
 Answers of such a gateway look old, or from the future, and commands to it are `stale`. Stops, e-stops and pauses do not
 depend on a clock. A state that was published just now shows the difference: its stamp is by the gateway's clock, and it
 came at a time by our clock. A delay on the way makes the gateway's clock look later than it is, so the message with the
-largest lead over our clock counts. One message is not enough, because it may have been delayed by a pause of the
-network or of a process.
+largest lead over our clock counts. One message is not enough, because the network or a process may have delayed it.
 
 A gateway that hangs publishes nothing, so nothing is known about its clock. A replay publishes old stamps at the usual
 rate, but is not a gateway: the caller must leave it out. Pure.
@@ -16,7 +15,7 @@ from typing import Final
 MAX_CLOCK_OFF_S: Final = 5.0
 """Maximum difference of two clocks that is not reported. A gateway refuses a command from further in the future."""
 _KEPT: Final = 8
-"""Number of messages that are remembered: two seconds of four states."""
+"""Number of messages that are remembered: those of two seconds, as each of four states comes once a second."""
 _MIN_STAMPS: Final = 2
 _NS: Final = 1e9
 

@@ -63,7 +63,7 @@ def gaps(readings: Iterable[Reading]) -> dict[str, int]:
 def describe_shortfalls(
     readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
 ) -> list[str]:
-    """Describe why there are fewer readings than requested: a line for each key, but only one for all keys of states.
+    """Describe why there are fewer readings than requested: one line for each key, one for all states together.
 
     readings: sorted as `merge` sorts.
     """

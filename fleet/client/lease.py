@@ -69,7 +69,7 @@ class LeaseMonitor:
 
     def _denial(self, authority: Authority) -> Denial | None:
         """Return why a pause, a loan or the people of the fleet keep us from the car."""
-        # A hold may be older than our lease, and then it has ended nothing.
+        # A hold may be older than our lease, and then it has not ended the lease.
         return replace(authority, hold=None).may(authority.people.ranked(self._sender), Right.ACT)
 
     def on_outcome(self, outcome: Outcome) -> None:

@@ -24,7 +24,7 @@ OUTCOME_MARGIN_S: Final = 5.0
 GATEWAY_RETURN_TIMEOUT_S: Final = 1.0
 """Timeout for a gateway to rejoin the bus. A gateway tries to do so twice a second."""
 GATEWAY_RESTART_TIMEOUT_S: Final = 15.0
-"""Timeout for the new gateway of a car if a supervisor starts one. The supervisor takes 4 s to notice a hang."""
+"""Timeout for a car's new gateway if a supervisor starts one. The supervisor takes 4 s to notice a hang."""
 OVERLOAD_ANSWER_TIMEOUT_S: Final = 10.0
 """Timeout for an answer on an overloaded machine. The token shows much earlier that a gateway has gone."""
 LATE_ANSWER_S: Final = 2.0
@@ -147,12 +147,12 @@ class Progress:
 
     @property
     def awaits_bus(self) -> bool:
-        """True if it is a stop that waits for the bus, to be sent again."""
+        """True if this is a stop that is sent again once the bus is back."""
         return self.outcome is None and self._bus_lost_until is not None and not self.answered
 
     @property
     def _joined(self) -> bool:
-        """True if the command extends a running drive, whose end is then recorded under the earlier id.
+        """True if the command extends a running drive. The end of the drive is then recorded under the earlier id.
 
         A drive that begins is queued before it is sent, an extension is not.
         """

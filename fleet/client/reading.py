@@ -75,7 +75,7 @@ class Reading:
         return value_in(self.value)(field)
 
     def age_s(self, now: datetime | None = None) -> float:
-        """Return the age, s, by this machine's clock. If the clocks differ so that it would be negative, return 0."""
+        """Return the age, s, by this machine's clock. Return 0 if it would be negative, as the clocks may differ."""
         return max(0.0, ((now or datetime.now(UTC)) - self.time).total_seconds())
 
     def stale(self, now: datetime | None = None) -> bool:
