@@ -12,7 +12,7 @@ UNKNOWN_TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Debounced:
-    """A condition that counts as true (`on`), or that has not been true for long enough yet."""
+    """A condition that counts as true (`on`), or that has become true, but not yet for long enough."""
 
     on: bool
     since: float
@@ -21,7 +21,7 @@ class Debounced:
 
 
 def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the value itself
-    """Follow a condition. It is on after `for_s`. None after HYSTERESIS_S of false, or UNKNOWN_TIMEOUT_S of unknown."""
+    """Follow a condition: on after `for_s` of true, None after HYSTERESIS_S of false or UNKNOWN_TIMEOUT_S unknown."""
     if before is None or not before.on:
         if not value:
             return None

@@ -1,14 +1,14 @@
 """One step of the coordinator: what each car should do now, why, and the commands for it. Pure and deterministic.
 
-A plan says which roles there are and when rules give them to cars. Turning that into commands looks like a lookup, and
-would be one if cars were always connected, readings always fresh, and nobody else drove. But that is not so, and most
-of this module is about *not* acting.
+A plan says which roles there are and when rules give them to cars. Turning the plan into commands would be a lookup if
+cars were always connected, readings always fresh, and nobody else drove. But links break, readings become stale, and
+people drive. So most of this module is about *not* acting.
 
 First: whose car is it? The coordinator has the lowest rank. A car is left alone, whatever the plan says, if a person
 holds, drives, has paused or borrowed it, or if it cannot be reached. This module calls such a reason a *barrier*. Each
 barrier has a sentence for the person who asks why nothing happens. A car that is out of reach keeps its role for a
-while, because links come back within seconds. A fleet that reshuffles at every hiccup of a radio is worse than one role
-that is vacant for a moment.
+while, because links come back within seconds. A role that is vacant for a moment is better than a fleet that reshuffles
+at every hiccup of a radio.
 
 Second: what is true? Rules are evaluated in every step. But a rule comes into force only when its condition has been
 true for a time, and ends only when it has not been true for a time (`debounce`, `rules`). A comparison with a value
@@ -92,7 +92,7 @@ class DecisionStep:
     changed: tuple[Decision, ...] = ()
     """The decisions with a new cause."""
     reworded: tuple[Decision, ...] = ()
-    """The decisions with the same cause, but other words for the reason or for what would change them."""
+    """The decisions whose cause is the same, but whose words have changed (the reason, or what would change them)."""
     commands: tuple[CarCommand, ...] = ()
     roles: Mapping[str, str] = field(default_factory=dict)
 
@@ -122,7 +122,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     rules = follow_rules(plan, snapshot, cars, phase.name, memory.rules, now)
     phase = follow_phase(plan, snapshot, cars, phase, rules, now, ready=_is_ready(snapshot, subjects, barriers, memory))
     needs = follow_needs(plan, snapshot, subjects, memory.needs, now)
-    # The words for what would change a decision depend on the phase, so keep none of another phase.
+    # What would change a decision depends on the phase, so drop the words of another phase.
     reusable = memory.decisions if phase.name == memory.phase.name else {}
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
     if now - started_at < FIRST_STATE_TIMEOUT_S and any(
@@ -268,7 +268,7 @@ def _may_be_free_soon(known: CarSnapshot, barrier: Barrier) -> bool:
 
 
 def _is_in_decided_mode(known: CarSnapshot, last: Decision | None) -> bool:
-    """Return True if a car is in the mode that was decided for it last, or if none was because a rule wants none."""
+    """Return True if a car is in the mode that was last decided for it, or needs none. False if it was left alone."""
     if last is None or last.kind is DecisionKind.ALONE:  # this car can be commanded only since this step
         return False
     return last.mode is None or (known.mode == last.mode and known.verdict != Verdict.CONTRADICTED and not known.busy)
@@ -284,7 +284,7 @@ def _find_barrier(car: str, known: CarSnapshot) -> Barrier | None:
     """Return why the car is left alone. None if it is not."""
     if not known.present:
         return Barrier(f"{car} is not on the bus", "its gateway comes up")
-    if not known.mode:  # without a state, it is not known either whether the car is on hold
+    if not known.mode:  # without a state, a hold is not known either
         return Barrier(f"{car} has published no state yet", "its gateway publishes its first states")
     if known.estopped_by is not None:
         return Barrier(

@@ -10,7 +10,7 @@ LEFT_ALONE: Final = "left alone"
 
 
 class DecisionKind(StrEnum):
-    """Kind of a decision. About a car it says what decides; otherwise whether it is about a role or the phase."""
+    """Kind of a decision. For a car: what decided. For a role: how it stands. PHASE is for the phase."""
 
     ROLE = "role"
     RULE = "rule"
@@ -45,10 +45,7 @@ class Decision:
     """Time at which the cause became the current one, s on the step's clock."""
 
     def after(self, before: "Decision | None", now: float) -> "Decision":
-        """Return the decision that is in force after the one of the last step, `before`.
-
-        It is `before` itself if this decision says the same, so that the readings stay. Otherwise it is this decision.
-        """
+        """Return `before`, the last step's decision, if this one says the same (its readings stay), else this one."""
         if before is None or before.cause != self.cause:
             return replace(self, since=now)
         if (before.decided, before.why, before.would_change) == (self.decided, self.why, self.would_change):

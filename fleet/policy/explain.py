@@ -51,7 +51,7 @@ def explain_phase(plan: Plan, state: PhaseState, snapshot: FleetSnapshot) -> Dec
 
 
 def _unmeasured_part(condition: PlanCondition, snapshot: FleetSnapshot) -> str:
-    """Name the readings of a condition that no present car measures. Empty if one car measures them all."""
+    """Name the readings of a condition that no present car measures. Empty if one of the cars measures them all."""
     cars = [known for car, known in snapshot.cars.items() if known.present and condition.car in (None, car)]
     return describe_unmeasured(condition.expression, [(known, known.mode) for known in cars])
 
@@ -126,10 +126,7 @@ def is_reworded(decision: Decision, before: Mapping[str, Decision]) -> bool:
 def explain_role(
     car: str, held_role: HeldRole, candidates: Candidates, allocation: RoleAllocation, phase: str, last: Decision | None
 ) -> Decision:
-    """Explain a mode that a role gives the car.
-
-    `last` is the car's last decision in this phase: reuse it if unchanged.
-    """
+    """Explain a mode that a role gives the car. `last`, its last decision in this phase, is reused if unchanged."""
     plan, name = candidates.plan, held_role.role
     role = plan.roles[name]
     pinned = candidates.pinned.get(car)

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 def assign(costs: Mapping[str, Mapping[str, int]], places: Mapping[str, int]) -> dict[str, str]:
     """Return each car's role: at most one per car, at most `places[role]` cars per role, at the lowest total cost.
 
-    `costs[car][role]` is the cost of the car in the role. A car without a role costs 0. Roles that the car may not have
-    are left out. If several results have the same total cost, the order of cars and roles decides, so the result is
-    deterministic.
+    `costs[car][role]` is the cost of the car in the role. A car without a role costs 0. `costs[car]` has only the roles
+    that the car may have. If several results have the same total cost, the order of cars and roles decides, so the
+    result is deterministic.
     """
     matching = _Matching(costs, places)
     for car in costs:

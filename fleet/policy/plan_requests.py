@@ -28,7 +28,7 @@ EVENTS: Final = {
     PlanRequest.NEXT: ("plan_next", "went on to the next phase"),
     PlanRequest.STOP: ("plan_stopped", "stopped the plan"),
 }
-"""Code and words of the event for each request. The event begins with the sender, followed by the words."""
+"""Code and words of the event for each request. The sender comes before the words."""
 
 
 class RequestRefused(Exception):

@@ -1,8 +1,8 @@
 """Gives open roles to cars. Pure; times in s.
 
-Most important are filled places, first those of high priority. Within one priority, the places of a role with a number
-come before the places of a role for all cars. Then cars should keep their roles, few modes should change, and the order
-in the plan decides the rest.
+What counts, the most important first: filled places, above all those of high priority; cars that keep their roles; few
+changes of mode; the order in the plan. Within one priority, the places of a role with a number come before the places
+of a role for all cars.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ REFUSED_MODE_RETRY_S: Final = 10.0
 _REFUSALS: Final = frozenset({Reason.BATTERY_LOW, Reason.UNSUPPORTED, Reason.LINK_DOWN, Reason.WRITE_FAILED})
 """Reasons that lie with the car itself. Holds and leases are known from its states."""
 _STAND_IN: Final = "/"
-"""Suffix of a role's name for a place in it that stands in for another role."""
+"""Suffix of a role's name for those of its places that stand in for another role."""
 _ROLE_LOSS_COST: Final = 1_000_000_000
 _MODE_CHANGE_COST: Final = 1_000_000
 _LINK_DOUBT_COST: Final = 10_000
@@ -104,7 +104,7 @@ class Candidates:
 
 
 def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
-    """Return the barrier between a car and a role that does not depend on readings. None if there is none."""
+    """Return the barrier between a car and a role, as far as it does not depend on readings. None if there is none."""
     if known.roles is not None and role.name not in known.roles:
         return Barrier("the fleet file does not let it take this role", "the fleet file lets it")
     profile = known.profile
@@ -141,7 +141,7 @@ def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
 
 @dataclass(frozen=True, slots=True)
 class RoleAllocation:
-    """Roles of the cars, and number of places of each role."""
+    """The roles of the cars, and the number of places of each role."""
 
     roles: Mapping[str, str]
     places: Mapping[str, int]
@@ -265,7 +265,7 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
             if car in candidates.unresponsive and known.verdict == Verdict.CONTRADICTED and role.count is not None:
                 cost += _ROLE_LOSS_COST
             elif candidates.roles_before.get(car) == role.name:
-                # For a role for all cars, the loss counts half, so that its holder may move to a role with a number.
+                # The loss of a role for all cars counts half, so that its holder may move to a role with a number.
                 cost -= _ROLE_LOSS_COST if role.count is not None else _ROLE_LOSS_COST // 2
             if known.mode != role.mode or known.verdict == Verdict.CONTRADICTED:
                 cost += _MODE_CHANGE_COST

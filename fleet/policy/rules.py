@@ -87,9 +87,9 @@ def follow_rules(
 def _follow_rule(rule: Rule, snapshot: FleetSnapshot, cars: CarSets, before: RuleState, now: float) -> RuleState:
     """Return the new state of one rule.
 
-    Without `until`, the rule is in force while its condition is true. With it, the rule stays in force until that is
-    true, while the car that triggered it is present. If that car is gone, a car for which the condition is true takes
-    its place, or else the rule ends.
+    Without `until`, the rule is in force while its condition is true. With `until`, it stays in force until that
+    condition is true, as long as the car that triggered the rule is present. If that car is gone, another car for which
+    the rule's condition is true takes its place. If there is none, the rule ends.
     """
     when = _debounce_by_car(rule.when, snapshot, cars, before.when, now)
     true_for = [car for car, debounced in when.items() if debounced.on]

@@ -121,7 +121,8 @@ class CarSnapshot:
     evidence: str = ""
     motors: str = ""
     doubted: bool = False
-    """True if the car has shown its stops before, but not the last one. Never True for a car that cannot show stops."""
+    """True if the car has shown its stops before, but not the last one. Always False for a car that cannot show
+    stops."""
     link: str = ""
     """The state of its link, as its gateway reports. Empty if there is no report yet."""
     platform: str = ""
@@ -144,7 +145,7 @@ class CarSnapshot:
 
     @property
     def taken_by(self) -> str | None:
-        """The person because of whom the coordinator may not command the car until a person releases it, or None."""
+        """The person who has taken the car from the coordinator until a person releases it, or None."""
         return self.estopped_by or self.paused_by or self.lent_to or self.held_by
 
     @property
@@ -180,8 +181,8 @@ class FleetSnapshot:
     def holds(self, expression: Expression, car: str, now: float, *, old: bool = False) -> bool | None:
         """Return whether the expression is true for this car, or None if that is not known.
 
-        Stale values count as not measured, unless `old` is set. It is for values that change slowly: in a mode in which
-        the car does not measure them, the last value counts.
+        Stale values count as not measured. With `old`, the last value counts instead: for values that change slowly, in
+        a mode in which the car does not measure them.
         """
         seen = self.readings.get(car)
         if seen is None:

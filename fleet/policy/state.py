@@ -16,7 +16,7 @@ from schemas.words import Mode
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Reason for a role that a car had before a restart of the coordinator."""
 HUB_RETURN_GRACE_S: Final = 5.0
-"""Maximum time to wait for gateways after the hub is back. Their cars keep their roles for this time. Gateways try to
+"""Maximum time to wait for gateways after the hub is back. Their cars keep their roles so long. Gateways try to
 reconnect every 0.5 s."""
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
@@ -65,7 +65,7 @@ class PersistedPolicy:
 
 @dataclass(frozen=True, slots=True)
 class LedRequest:
-    """Notes that a car was commanded to show the color of a rule since the rule came into force."""
+    """Notes that a car was commanded to show the color of a rule, after the rule came into force."""
 
     rule: int
     effect: int
@@ -147,8 +147,8 @@ def restore(plan: Plan, snapshot: FleetSnapshot, persisted: PersistedPolicy, now
     """Return the state of a coordinator that starts, from the persisted state of the previous one.
 
     Under another plan, only roles that both plans have are restored. A car that is in the mode of another role loses
-    its role, because somebody has changed its mode since. If the plan was stopped, the new plan is stopped, too, even
-    if it is another one.
+    its role, because somebody has changed its mode since. If the previous plan was stopped, this plan is stopped, too,
+    even if it is another one.
     """
     if persisted.stopped_by:
         return PolicyState(stopped_by=persisted.stopped_by, to_rest=frozenset(persisted.to_rest))
