@@ -153,7 +153,7 @@ class Expression:
     def value(self, lookup: Lookup) -> bool | None:
         """Return whether it is true, or None if that is not known because a value was not measured (None or NaN).
 
-        Raises TypeError for a value that is not of its name's type, which is a mistake of the caller.
+        Raises TypeError if a value is not of its name's type: that is a mistake of the caller.
         """
         return _evaluate(self.root, lookup)
 

@@ -19,7 +19,7 @@ LAST: Final = ("car", "seq", "boot_id")
 """Fields of every message. They are the last ones in lists of names."""
 
 OWNERS: Final = frozenset({"by", "holder", "owner", "sender"})
-"""Fields with a sender: a person, or the process of one (`mia@laptop-4711`)."""
+"""Fields with a sender: a person, or a person's process (`mia@laptop-4711`)."""
 SHORT_NAMES: Final = MappingProxyType({"distance_m": "range.range_m", "battery_v": "battery.voltage_v"})
 """Everyday names of fields, each with topic and field."""
 
@@ -53,7 +53,7 @@ def value_in(message: Message) -> Callable[[str], object | None]:
 
 
 def compared_in(message: Message) -> Callable[[str], object | None]:
-    """Return a lookup of the values that conditions compare. For an owner, this is the person without the process."""
+    """Return a lookup of the values that conditions compare. For a sender, that is the person without the process."""
     look = value_in(message)
 
     def value(name: str) -> object | None:

@@ -4,7 +4,7 @@
 
 The meaning of "for two seconds" depends on what counts as a gap. Between two readings nothing is measured, but this
 time counts as long as the older value is not stale. When a value becomes stale, the condition is evaluated again
-without it. If the other values alone do not make the condition true, it ended with the last reading that showed it.
+without it. If the condition is not true by the other values alone, it ended with the last reading that showed it.
 """
 
 from collections.abc import Callable
@@ -14,11 +14,11 @@ from typing import Final, NamedTuple
 from fleet.conditions.expression import Expression, Lookup
 
 CLOCK_STEP_S: Final = 60.0
-"""A difference between stamps and arrivals of at least this size is a step of a clock, and not a network delay."""
+"""Stamps and arrivals that differ by at least this time show a step of a clock, and not a network delay."""
 
 
 class HeldSpan(NamedTuple):
-    """A time during which a condition held. Times of the first and last reading that show it, ns since the epoch."""
+    """A time for which a condition held: from the first to the last reading that shows it, ns since the epoch."""
 
     begin_ns: int
     end_ns: int

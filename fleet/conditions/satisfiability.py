@@ -1,7 +1,7 @@
-"""Finds conditions that can never be true. Sound, not complete: some of them are not found. Pure.
+"""Finds conditions that can never be true. Pure. It may miss some, but each that it finds is never true.
 
-A condition is split into alternatives, each a set of comparisons that make it true together. An alternative is
-possible unless its comparisons of one field, or of two fields with each other, exclude each other.
+A condition is split into alternatives. Each is a set of comparisons that together make the condition true. An
+alternative is impossible if its comparisons of one field exclude each other, or those of two fields with each other.
 """
 
 from collections.abc import Iterable
@@ -20,7 +20,7 @@ _DOMAINS: Final = {
     for topic in topics.TOPICS.values()
     for name in {*topic.words, *topic.ranges}
 }
-"""Allowed words and range by name. The name of a field begins with the last word of its topic."""
+"""Allowed words and range by name. A name is the last word of the topic and the field, such as `range.range_m`."""
 _Alternative: TypeAlias = tuple[Compare, ...]
 _RELATIONS: Final = {Op.LT: "<", Op.LE: "<=", Op.GT: ">", Op.GE: ">=", Op.EQ: "=", Op.NE: "<>"}
 """The relations of two values that fulfil each operator, one character for each."""
@@ -37,7 +37,7 @@ def is_contradictory(expression: Expression) -> bool:
 
 
 def explain_impossible(expression: Expression, of: str = "") -> str:
-    """Return why the condition can never be true by the words and ranges of schemas/topics.py. Empty if it can be true.
+    """Return why the words and ranges of schemas/topics.py exclude the condition. Empty if it can be true.
 
     `of` is the last word of the topic, if the names are the fields of one message.
     """
@@ -67,7 +67,7 @@ class _TooManyAlternativesError(Exception):
 
 
 def _alternatives_of(node: Node, *, wanted: bool) -> list[_Alternative]:
-    """Return the alternatives that make a condition true, or (not `wanted`) false."""
+    """Return the alternatives that make a condition true, or false if not `wanted`."""
     match node:
         case Literal(value):
             return [()] if value is wanted else []
