@@ -1,6 +1,6 @@
 """The coordinator: a client of the bus with a policy. Samples come in, commands and publications go out.
 
-policy/ makes all decisions, even the decision to leave a car on hold alone. The gateway also enforces the hold.
+policy/ makes all decisions. It also decides to leave a car on hold alone, and the gateway enforces the hold, too.
 """
 
 import time
@@ -134,7 +134,7 @@ class Coordinator:
                 self.client.close()  # ends pending commands
 
     def _check_sleep(self, observer: FleetObserver, now: float) -> None:
-        """After a sleep of the computer, decide only by new readings. No car loses its role by the sleep."""
+        """After a sleep of the computer, decide only by new readings. No car loses its role because of the sleep."""
         if (slept_s := self.sleep.take()) > 0:
             observer.on_sleep(0.0 if MONOTONIC_COUNTS_SLEEP else slept_s)
             self._memory = on_hub_back(self._memory, now)

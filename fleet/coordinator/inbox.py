@@ -40,15 +40,15 @@ Item = Sample | QueriedSample | zenoh.Query
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """Messages and changes that a program that only listens has taken from its inbox at one time."""
+    """What a program that only listens takes from its inbox at one time: messages, and gateways that came or left."""
 
     now: float
     """The time at which they were taken from the inbox, s, monotonic."""
     gateways: Mapping[str, bool]
     """The cars whose gateways arrived (True) or left."""
     samples: Sequence[tuple[Sample, float | None]]
-    """Messages. A message from a query may be old: it has the wall clock now, s. One that was just published has
-    None."""
+    """Messages, each with the wall clock (s) if a query returned it, as it may be old, or None if it was just
+    published."""
 
 
 class Inbox:
@@ -160,7 +160,7 @@ class Inbox:
         return self._tokens.take()
 
     def query_arrived(self, changes: Mapping[str, bool], pool: ThreadPoolExecutor, *, began: bool) -> None:
-        """Query the states of the cars that arrived. Until the plan `began`, all cars are queried anyway."""
+        """Query the states of the cars that arrived. Before the plan `began`, all cars are queried anyway."""
         for car, alive in changes.items():
             if alive and began:
                 self._arrived.add(car)

@@ -68,7 +68,7 @@ class FleetObserver:
         )
 
     def on_token(self, car: str, now: float, *, alive: bool) -> None:
-        """Note that a gateway came or went, and drop its car's states: a hold may have changed meanwhile."""
+        """Note that a gateway came or went. Drop its car's states: a hold may have changed in the meantime."""
         try:
             keys.check_name(car)
         except keys.BadKey:
@@ -82,8 +82,8 @@ class FleetObserver:
             self._absent_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
         if (state := self.states.get(car)) is not None:
-            # A gateway that comes back counts as new. If a recording is played in a loop, the same gateways come back
-            # each time.
+            # A gateway that comes back counts as new. When a recording is played in a loop, it is the same gateway each
+            # time.
             readings = {topic: each for topic, each in state.newest_by_topic.items() if topic.startswith("sensor/")}
             self.states[car] = CarState(car, alive, readings)
 
@@ -111,10 +111,7 @@ class FleetObserver:
             self.cars[car] = replace(self.cars[car], refused=refusal)
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
-        """Add a message. If a query returned it, it may be old: then `wall_s` is the wall clock.
-
-        Otherwise it is None.
-        """
+        """Add a message. `wall_s` is the wall clock for an answer to a query, which may be old, and otherwise None."""
         key = keys.parse(sample.key)
         topic = None if key is None else topics.TOPICS.get(key.topic)
         if key is None or topic is None:

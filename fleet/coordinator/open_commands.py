@@ -25,7 +25,7 @@ class OpenCommands:
         return self._modes.keys()
 
     def send(self, commands: Iterable[CarCommand], pool: ThreadPoolExecutor) -> None:
-        """Send commands. Skip a color of a blink if the car's last color command has no outcome yet."""
+        """Send commands. Skip a color of a blinking LED if the car's last color command has no outcome yet."""
         for command in commands:
             if command.blink and any(command.car == other.car for other, _ in self._leds):
                 continue  # the link or the car is too slow for this blinking

@@ -22,7 +22,7 @@ def declare_alone(client: Fleet) -> None:
 
 
 def yield_to_another(client: Fleet) -> None:
-    """Raise AnotherCoordinator if one whose name sorts before ours started at the same moment."""
+    """Raise AnotherCoordinator if another coordinator started at the same moment, and its name sorts before ours."""
     if others := [name for name in _others(client) if name < client.sender]:
         raise _another(client, others)
 
