@@ -15,9 +15,9 @@ from schemas.words import LinkState
 MAX_CARS_LISTED: Final = 8
 """Maximum number of cars that one line lists."""
 READY_TIMEOUT_S: Final = 30.0
-"""Time without another ready car after which a start ends, although somebody is missing."""
+"""A start ends after this time without another ready car, although somebody is missing."""
 LINK_OPEN_TIMEOUT_S: Final = 10.0
-"""The time that replaces READY_TIMEOUT_S if everything runs and only the links of cars cannot be opened."""
+"""The timeout in place of READY_TIMEOUT_S if everything runs, and only links of cars cannot be opened."""
 REACHED_S: Final = 2.0
 """Time for which a link must be open to count as a link to a car, if the car sends nothing."""
 RATE_WINDOW_S: Final = 2.0
@@ -92,7 +92,7 @@ class CarStatus:
             self._counted = (now, frames)
 
     def _change(self, what: str, words: str) -> str:
-        """Return the words if they are new. A growing time is not new, nor are normal values in the first message."""
+        """Return the words if they are new. A growing time is not new, nor is a normal value in the first message."""
         essence = _SECONDS.sub("", words)
         before, self._reported[what] = self._reported.get(what), essence
         return "" if essence == before or (before is None and words in _AT_FIRST) else words

@@ -18,7 +18,7 @@ def read(pid: int) -> CpuTime | None:
     if not _PROC.joinpath("self", "stat").exists():
         return _of_ps(pid)
     try:
-        # The state follows the name, and the name may contain blanks and brackets.
+        # The state comes after the name, which is in brackets and may itself contain blanks and brackets.
         state = (_PROC / str(pid) / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
         run_ns, wait_ns, *_ = (_PROC / str(pid) / "schedstat").read_text(encoding="ascii").split()
     except (OSError, ValueError, IndexError):

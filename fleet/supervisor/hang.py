@@ -16,13 +16,13 @@ MAX_POLL_GAP_S: Final = 0.5
 MANY_SHARE: Final = 0.25
 """Minimum share of silent processes that indicates a common cause."""
 MANY_SILENT_S: Final = 30.0
-"""Maximum silence of a process while many are silent: longer than the 8 s after which a blocked hub is replaced."""
+"""Maximum silence of a process while many are silent. It exceeds the 8 s after which a blocked hub is replaced."""
 SLOW_SILENT_S: Final = 30.0
 """Maximum silence of a slow process."""
 MOVING_SILENT_S: Final = 300.0
 """Maximum silence of a slow gateway whose car may move. It is long, because only this gateway can stop the car."""
 CPU_WINDOW_S: Final = 3.0
-"""How far back the samples of a process's CPU time go."""
+"""Time over which the samples of a process's CPU time are kept."""
 SAMPLE_INTERVAL_S: Final = CPU_WINDOW_S / 6
 MIN_CPU_WINDOW_S: Final = 0.9
 """Minimum time from the first sample to the last one. A shorter time shows nothing."""
@@ -97,7 +97,7 @@ class Pulse:
 def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
     """Return how long a process may be silent for a reason other than a hang.
 
-    If its own patience is longer, that counts. The result is 0 if only a hang explains the silence.
+    The result is 0 if only a hang explains the silence. The patience of the process counts if it is longer.
     """
     longest = MANY_SILENT_S if many else 0.0
     if sign is Sign.SLOW:
@@ -108,7 +108,7 @@ def longest_silence_s(sign: Sign, *, many: bool, may_move: bool) -> float:
 def longest_hub_silence_s(sign: Sign) -> float:
     """Return how long a hub may be silent, as `longest_silence_s` does for the other processes."""
     # A hub that uses a whole CPU is not hung: after a stall, a hundred sessions reconnect at once and keep its threads
-    # busy. A hub in which only the main thread still polls may look the same.
+    # busy. But a hub may also look so if only its main thread still polls.
     return SLOW_SILENT_S if sign in (Sign.SLOW, Sign.SPINNING) else 0.0
 
 

@@ -22,15 +22,15 @@ from schemas.words import ProcessKind, RunState
 SUPERVISOR_POLL_INTERVAL_S: Final = 0.1
 """Interval at which the supervisor polls its processes."""
 STARTS_AT_ONCE: Final = 1 + (os.cpu_count() or 1)
-"""Maximum number of gateways that start at the same time. Each needs a whole CPU for 0.3 s in total, with waits."""
+"""Maximum number of gateways that start at the same time. Each needs 0.3 s of CPU time, with waits in between."""
 MISSED_HEARTBEAT_S: Final = 2.0
 """Silence after which a process counts as silent: it has missed one heartbeat."""
 CPU_CHECK_SILENCE_S: Final = 1.0
 """Silence after which a process's CPU time is sampled."""
 
 
-# A hub sends no heartbeats, because its main thread does not show whether Zenoh's routing threads hang. Our link to the
-# hub is its heartbeat.
+# A hub sends no heartbeats: its main thread does not know whether Zenoh's routing threads hang. Our link to the hub
+# serves as its heartbeat.
 _HEARTBEAT_KINDS: Final = tuple(kind for kind in ProcessKind if kind is not ProcessKind.HUB)
 
 
@@ -142,7 +142,7 @@ class ProcessSet:
         silent = {process.name: process.status.silent_s(now, since(process)) for process in self}
         judged = [process for process in self.of(*_HEARTBEAT_KINDS) if process.status.state is RunState.RUNNING]
         many = have_common_cause(sum(silent[process.name] > MISSED_HEARTBEAT_S for process in judged), len(judged))
-        # The process that has waited longest comes first. So a few processes that crash again and again do not delay
+        # Start the process first that has waited longest. So a few processes that crash again and again do not delay
         # the others.
         for process in sorted(self, key=lambda each: each.status.due):
             if silent[process.name] > CPU_CHECK_SILENCE_S and process.child is not None and process.pulse.is_due(now):

@@ -84,7 +84,7 @@ class ProcessState:
         return self.state in (RunState.STARTING, RunState.RUNNING, RunState.ENDING)
 
     def silent_s(self, now: float, listening_since: float | None) -> float:
-        """Return the time since the last heartbeat that could have been received. 0 if none is expected."""
+        """Return for how long heartbeats could have been received, but none was. 0 if none is expected."""
         if listening_since is None or self._killed or not self.alive:
             return 0.0
         if self.state is RunState.ENDING and not self.patience.to_the_end:
@@ -96,7 +96,7 @@ class ProcessState:
         """Return the next action.
 
         `listening_since` is the time since which heartbeats could be received without a break, or None if they cannot
-        be received now. `leave_s` is the allowed silence (from `hang`). It counts if it is longer than the patience.
+        be received now. `leave_s` is the silence that `hang` allows, and counts if it is longer than the patience.
         """
         if self.state in (RunState.WAITING, RunState.REFUSED) and now >= self.due:
             return RestartAction.START

@@ -29,14 +29,14 @@ GATEWAY_START_TIMEOUT_S: Final = 20.0
 NOT_TRIED: Final = "not connected yet"
 """The reason that a gateway gives for a lost link before its first attempt to open it."""
 CAR_LINK_TIMEOUT_S: Final = 8.0
-"""Timeout after the first heartbeat for the link to the car."""
+"""Timeout for the link to the car, from the first heartbeat."""
 
 
 class GatewayShutdown:
     """The gateways that are being shut down.
 
-    A gateway that crashed or was killed before its car stopped is replaced once in any case. If a gateway reports that
-    it could not stop its car, it is replaced until `hurry`, provided that the car was ever reached.
+    A gateway that crashed or was killed before its car stopped is always replaced once. A gateway that reports that it
+    could not stop its car is replaced until `hurry`, if a gateway has ever reached the car.
 
     `on_result` is called with a car's name and the result. `exists` returns False if the car was a simulated one whose
     simulator has ended.
@@ -61,9 +61,10 @@ class GatewayShutdown:
         self._tries: dict[str, int] = {}
         """Number of new gateways that were started to stop a car."""
         self._unclaimed: dict[str, float] = {}
-        """Gateways that ended normally before their last state arrived, with the time until which to wait for it."""
+        """Gateways that ended normally before their last state arrived, each with the time at which the wait for it
+        ends."""
         self.results: dict[str, str] = {}
-        """Result by car, without the cars that a reload removed."""
+        """Result by car. Cars that a reload removed are not in it."""
 
     @property
     def pending(self) -> list[str]:

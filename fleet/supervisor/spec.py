@@ -25,7 +25,7 @@ SIMULATED: Final = "sim"
 """The link of a car that the supervisor's simulator simulates."""
 SIMULATED_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "orange", "violet", "white", "black")
 PLATFORMS: Final = (Platform.ARDUINO, Platform.STM32, Platform.ARDUINO, Platform.RASPBERRY_PI)
-"""Platforms of simulated cars without a fleet file, in turn."""
+"""Platforms that simulated cars get in turn if there is no fleet file."""
 MAX_SIMULATED_CARS: Final = 200
 RECORDINGS: Final = Path("sessions")
 
@@ -132,8 +132,8 @@ class UpOptions:
 def build_spec(file: FleetFile | None, options: UpOptions) -> FleetSpec:
     """Return the spec of a fleet file and the options, which take precedence.
 
-    The first `options.simulated` cars of the file are simulated, whatever their link. Those of them that cannot be are
-    left out with a warning. Raises ValueError if none of them can be.
+    The first `options.simulated` cars of the file are simulated, whatever their link. Cars among them that cannot be
+    simulated are left out with a warning. Raises ValueError if none can be simulated.
     """
     specs = {} if file is None else {**file.cars, **file.unlinked}
     cars = {name: _car(spec) for name, spec in specs.items()}
@@ -218,7 +218,7 @@ def _car(spec: FleetCar) -> CarProcessSpec:
 
 
 def _people(car: str, people: Mapping[str, FleetPerson]) -> tuple[str, ...]:
-    """Return the options of a gateway that name the people who may drive its car, and people who drive only others."""
+    """Return the options of a gateway that name the people who drive its car, and those who drive only others."""
     named = [
         f"{name}:lead" if person.rank is PersonRank.LEAD else name if person.may_drive(car) else f"{name}:other"
         for name, person in people.items()
@@ -266,8 +266,8 @@ def gateway_command(spec: FleetSpec, car: CarProcessSpec, link: str, endpoint: s
     """Return the command of a car's gateway."""
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--retry", *parent_option())
     options = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
-    # The link of a simulated car changes with each run. So holds belong to the folder: the next run in this folder has
-    # the same car.
+    # The link of a simulated car changes with each run. So its holds belong to the folder of the
+    # fleet: the next run in that folder has the same car.
     folder = (Path.cwd() if spec.file is None else spec.file.parent).resolve()
     same = ("--holds-of", f"{SIMULATED} in {folder}") if car.link == SIMULATED else ()
     return module("gateway.cli", "run", *options, *same, *where)

@@ -10,7 +10,7 @@ from typing import Final
 from schemas.token_bucket import TokenBucket
 
 START_SLOT_TIMEOUT_S: Final = 10.0
-"""Maximum time for which a starting process delays others. A hung process must not block them."""
+"""Maximum time for which a starting process delays others, because one that hangs must not block them."""
 RESTARTS_AT_ONCE: Final = 16
 RESTART_INTERVAL_S: Final = 1.0
 """Interval of further restarts in the whole fleet. A restart takes 0.3 to 0.7 s of CPU time."""

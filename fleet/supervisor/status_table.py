@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 DRAW_INTERVAL_S: Final = 0.25
 DRAW_IDLE_FACTOR: Final = 10.0
-"""Minimum pause, as a multiple of the time to draw. A hundred rows take 50 ms."""
+"""Minimum pause between two drawings, as a multiple of the time of one. A hundred rows take 50 ms."""
 _LINK: Final[dict[str, str]] = {
     LinkState.ONLINE: "green",
     LinkState.QUIET: "green",

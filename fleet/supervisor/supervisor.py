@@ -259,7 +259,7 @@ class Supervisor:
             hub.status.schedule(now)
 
     def _check_recorder(self, now: float) -> None:
-        """Report that nothing is recorded if the recorder does not start and no other one of this fleet is heard."""
+        """Report that nothing is recorded if the recorder does not start, and no other of this fleet is heard."""
         recorder = self.processes.get(RECORDER)
         if recorder is None or self._shutdown_requested.is_set() or now < self._recorder_heard_at + RECORDER_LOST_S:
             return
@@ -357,7 +357,7 @@ class Supervisor:
         ):
             coordinator.command = command
         else:
-            # This also restarts a coordinator that rejected its arguments before.
+            # A coordinator that rejected its arguments before is restarted, too.
             self.processes.add(
                 COORDINATOR, ProcessKind.COORDINATOR, command, restart=not is_in_force and in_force is not None
             )
@@ -587,7 +587,7 @@ class Supervisor:
         return "stopping every car, then closing the recording"
 
     async def _reload(self, sender: str) -> str:
-        """Read the spec again and apply it as far as possible. Return words about changes.
+        """Read the spec again and apply it as far as possible. Return the changes in words.
 
         Raises ReloadRefused if nothing was changed, RestartNeeded if only a part was.
         """

@@ -30,7 +30,7 @@ from schemas.topics import Qos
 from schemas.words import Phase, Rank, Reason
 
 SECOND_CHECK_DELAY_S: Final = 0.3
-"""Time after which two supervisors that start at the same moment have both declared themselves on the bus."""
+"""Delay before a supervisor looks for others. Two that start at the same moment have then both declared themselves."""
 SERVICE_QUERY_TIMEOUT_S: Final = 2.0
 SUBSCRIPTIONS: Final = (
     "*/state/*",
