@@ -25,9 +25,9 @@ from schemas.bus.credentials import HUB
 from schemas.identity import IdentityRole, Service, parse, role_of
 
 _READS: Final = ("declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query")
-"""Messages with which a program asks for something."""
+"""Kinds of messages with which a program asks for something."""
 _TELLS: Final = ("put", "delete", "reply", "liveliness_token", "declare_queryable")
-"""Messages with which a program publishes or answers, or offers to do so."""
+"""Kinds of messages with which a program publishes or answers, or offers to do so."""
 
 _SERVICES: Final = (keys.COORDINATOR, keys.RECORDER, keys.SUPERVISOR, keys.SIMULATOR, keys.OPERATOR, keys.REPLAY)
 _PUBLIC: Final = (
@@ -108,7 +108,7 @@ def _answers(identity: str) -> list[dict[str, Any]]:
     if known is None:
         return []
     role, name = known
-    # Others ask with wildcards. A query that is not included in a rule does not arrive.
+    # Others ask with wildcards, so allow the wildcards, too. A query that no rule includes does not arrive.
     is_asked = _rule(f"{identity} is asked", "egress", _READS, (*_PUBLIC, *_COMMANDS))
     if known == (IdentityRole.SERVICE, Service.LOCATOR):
         return [_rule(f"{identity} tells", "ingress", _TELLS, ("*/*/sensor/pose", "*/*/sensor/pose/@adv/**")), is_asked]

@@ -24,7 +24,7 @@ _SERVER: Final = ExtendedKeyUsageOID.SERVER_AUTH
 
 
 class BadRequestForCertificate(ValueError):
-    """A text that is not a request for a certificate, or is not signed with its own key."""
+    """The text is not a request for a certificate, or the request is not signed with its own key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +88,10 @@ def issue(authority: KeyPair, name: str, now: datetime, addresses: Iterable[str]
 
 
 def renew(authority: KeyPair, certificate: bytes, request: bytes, name: str, now: datetime) -> bytes:
-    """Return the next certificate for the same key, if this one is in force and due. Raises BadRequestForCertificate.
+    """Return the next certificate for the same key, if `certificate` is in force and due.
 
-    The request proves that the sender has the key. The names of a site's hub are copied from the old certificate.
+    Raises BadRequestForCertificate. The request proves that the sender has the key. The names of a site's hub
+    are copied from the old certificate.
     """
     ca = x509.load_pem_x509_certificate(authority.certificate)
     try:

@@ -140,8 +140,8 @@ class HubStore:
         """Make missing or due certificates: of the authority, the hub, and the identities here. Then write the rules.
 
         `addresses` are IP addresses and names under which others reach the hub. `listens` are the hub's endpoints, if
-        they change. `take` are further identities for this computer. If another computer has a certificate for one of
-        them, that certificate becomes invalid. Raises OSError, BrokenHub.
+        they change. `take` are further identities for this computer. A certificate that another computer has for one of
+        them becomes invalid. Raises OSError, BrokenHub.
         """
         now = datetime.now(UTC) if now is None else now
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -167,8 +167,8 @@ class HubStore:
     def reserve(self, identity: str, now: datetime | None = None) -> None:
         """Write the rules for an identity of another computer that has no certificate yet. Raises OSError.
 
-        An earlier certificate of this identity becomes invalid now, also one on this computer. Raises BrokenHub for the
-        user of this computer, because that could not be undone.
+        An earlier certificate of this identity becomes invalid now, even if it is on this computer. Raises BrokenHub
+        for the identity of this computer's user, because nobody could undo that.
         """
         if identity == self.credentials.me:
             raise BrokenHub(f"{identity} uses the hub's own computer: invite somebody under another name")
@@ -178,7 +178,9 @@ class HubStore:
             self._save()
 
     def sign(self, request: bytes, identity: str, now: datetime, addresses: Iterable[str] = ()) -> bytes:
-        """Return the certificate of a reserved identity, PEM. addresses: those of its computer, if that becomes a hub.
+        """Return the certificate of a reserved identity, PEM.
+
+        addresses: the addresses of the joining computer, if it becomes a hub.
 
         Raises BadRequestForCertificate (even if the identity was revoked or invited again meanwhile) and OSError.
         """
@@ -231,7 +233,7 @@ class HubStore:
             entry = self.known.get(identity)
             if entry is None:
                 return False
-            entry.revoked = True  # do it again even if it is revoked, because the last time may have failed half way
+            entry.revoked = True  # also if it is revoked already: the last attempt may have failed half way
             self._forget_local(identity)
             self._save()
         return True
@@ -279,7 +281,7 @@ class HubStore:
             OF_SITES: access_control(sorted(allowed), of_site=True),
         }
         made = json.dumps(settings, indent=1).encode()
-        # Write the rules first, and then the list. If the disk is full in between, the list must not call somebody
+        # Write the rules first, then the list. Otherwise, if the disk is full in between, the list could call somebody
         # revoked who can still connect.
         if not path.exists() or path.read_bytes() != made:
             write_atomically(path, made, private=True)
@@ -306,5 +308,5 @@ class HubStore:
 
 
 def _until(now: datetime) -> str:
-    """Return when a certificate expires that is made now."""
+    """Return when a certificate that is made now expires."""
     return (now + LIFETIME).isoformat(timespec="seconds")

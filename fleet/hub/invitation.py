@@ -190,8 +190,8 @@ def join(
 ) -> Joined:
     """Join the hub on another computer. Raises NotJoined.
 
-    `addresses` are this computer's, in case it becomes a hub. own_authority: return True for the certificate of an
-    authority whose key this computer has, so that it sends no code to itself.
+    `addresses` are this computer's, in case it becomes a hub. own_authority: returns True for a certificate of an
+    authority whose key this computer has. Then no code is sent, because the hub is this computer.
     """
     where = f"{host}:{port}"
     anyone = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -199,7 +199,7 @@ def join(
     found = _ask(where, anyone, "GET", None)
     ca, fits = b"", False
     try:
-        # Allow only one certificate: OpenSSL would trust each of several, but the code checks only the first.
+        # Allow only one certificate: OpenSSL would trust all of them, but the code is compared with only one.
         ca = certificate_authority.only_certificate(str(found.get("ca")).encode())
         fits = code.fits(certificate_authority.fingerprint(ca))
     except ValueError:
@@ -239,7 +239,7 @@ def join_one_of(
 ) -> tuple[str, Joined]:
     """Join the hub that made a code, and return its host, too. found: host:port of any hubs. Raises NotJoined.
 
-    Hubs that did not make the code do not learn it. The other arguments are as for `join`.
+    The code is sent only to the hub that made it. The other arguments are as for `join`.
     """
     own, tried = list(addresses), 0
     for each in found:

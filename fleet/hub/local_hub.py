@@ -23,7 +23,8 @@ from schemas.state_dir import JOINED_FILE, STATE_VARIABLE, default_directory, di
 SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
 """Endpoint at which programs on the hub's own computer find the hub."""
 JOINED_BYTES: Final = 65_536
-"""More bytes than a joining computer stores: a key, two certificates, and at a site the rules of twenty identities."""
+"""Bytes of a test file: more than a joining computer stores (a key, two certificates, at a site the rules of twenty
+identities)."""
 SOMEBODY: Final = "operator"
 """The name of a user whose login is not valid as a person's name."""
 
@@ -81,7 +82,7 @@ def use(endpoint: str) -> None:
 
 
 def check_storage(host: str, port: int = 0) -> None:
-    """Raise NotJoined if this computer cannot store what it gets when it joins. So no code is used up for nothing.
+    """Raise NotJoined if this computer cannot store what it gets when it joins, before a code is used up.
 
     host: of the hub that this computer will use, empty if it must be found first. port: of that hub, if it is known.
     """

@@ -13,8 +13,8 @@ from cryptography.x509.oid import NameOID
 LIFETIME: Final = timedelta(days=397)
 """Lifetime of a certificate. Browsers reject certificates that last much longer."""
 _BACKDATED: Final = timedelta(days=1)
-"""Certificates begin earlier by this, because clocks differ. A Raspberry Pi without a network may show yesterday's
-time."""
+"""Time by which certificates begin earlier, because clocks differ. A Raspberry Pi without a network may show
+yesterday's time."""
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:
@@ -64,7 +64,7 @@ def end_entity(
 
 
 def key_usage(*, signs: bool) -> x509.KeyUsage:
-    """Return the usage of a key that signs certificates, or only itself in a handshake."""
+    """Return the usage of a key that signs certificates, or of one that is only for handshakes."""
     return x509.KeyUsage(
         digital_signature=not signs,
         content_commitment=False,
