@@ -24,7 +24,7 @@ _FIRST: Final = "the first adapter"
 
 @dataclass(frozen=True, slots=True)
 class AdapterCheck:
-    """The sums of one adapter. For `auto`: of all adapters of the computer together."""
+    """The load of one adapter. For `auto`: of all adapters of the computer together."""
 
     adapter: str
     cars: tuple[str, ...]
@@ -46,7 +46,7 @@ def list_adapters(directory: Path | None = None) -> list[str]:
 
 
 def check_adapters(links: Mapping[str, FleetLink], adapters: Sequence[str]) -> Iterator[AdapterCheck]:
-    """Yield the sums of each adapter that a car uses. `adapters` are the computer's, or empty if unknown."""
+    """Yield the load of each adapter that a car uses. `adapters` are the computer's, or empty if unknown."""
     first = adapters[0] if adapters else _FIRST
     by_adapter: dict[str, list[str]] = {}
     for car, link in links.items():
@@ -59,7 +59,7 @@ def check_adapters(links: Mapping[str, FleetLink], adapters: Sequence[str]) -> I
 
 
 def _sum(adapter: str, cars: Sequence[str], count: int) -> AdapterCheck:
-    """Return the sums of the cars that share `count` adapters."""
+    """Return the load of the cars that share `count` adapters."""
     notifications = len(cars) * CAR_NOTIFICATIONS_PER_S
     many = "car connects" if len(cars) == 1 else "cars connect"
     through = "it" if count == 1 and adapter != AUTO_ADAPTER else f"{count} adapter{'' if count == 1 else 's'}"

@@ -1,7 +1,8 @@
 """Reads a fleet file: the cars, their platforms, capabilities and limits. All faults are reported at once.
 
-The fields of a car override those of its type, which override the defaults. A list replaces the list below it;
-`limits` are merged field by field. This module opens no link: link_check.py checks whether the cars can be reached.
+The fields of a car override those of its type, which override the defaults. A list replaces the list of the type or the
+defaults. `limits` are merged field by field. This module opens no link: link_check.py checks whether the cars can be
+reached.
 """
 
 from collections.abc import Iterator, Mapping
@@ -255,8 +256,8 @@ def _resolve_path(path: Path, given: str | None) -> Path | None:
     return None if given is None else (path.absolute().parent / Path(given).expanduser()).resolve()
 
 
-# Contradictions between fields. They are searched for in the raw data, so that they are reported together with the
-# faults of single fields.
+# Contradictions between fields. They are found in the raw data, so that they are reported together with the faults of
+# single fields.
 
 
 def _find_contradictions(

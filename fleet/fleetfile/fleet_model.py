@@ -159,7 +159,7 @@ class LimitsEntry(Entry):
 class CommonEntry(Entry):
     """Fields that `defaults`, each type and each car can have."""
 
-    # Defaults are for editors only, or empty. fleet_file.py merges the layers from the text.
+    # These defaults are only shown by editors, or are empty. fleet_file.py merges the layers of the file itself.
     platform: _Platform = Field(
         default=AUTO,
         description="the program that runs on the car, with options, such as arduino+arm; auto: the gateway detects it",

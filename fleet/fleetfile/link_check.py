@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 HOST_TIMEOUT_S: Final = 3.0
 """Timeout for the reply of a host."""
 CLOSED_PORT: Final = 9
-"""A TCP port without a listener (discard): a reachable host refuses a connection at once."""
+"""A TCP port at which no host listens (discard). A reachable host refuses a connection to it at once."""
 
 
 @dataclass(frozen=True, slots=True)
