@@ -86,7 +86,8 @@ class Catalog:
         self.damage: dict[str, str] = {}
         """By name of a session: the parts that could not be read, in words."""
         self.unanswered: dict[str, str] = {}
-        """By name of a session: why its tables could not be written anywhere. If there is one, every question fails."""
+        """By name of a session: why its tables could not be written anywhere. While there is such a session, every
+        question fails."""
         self.sessions: list[CachedTables] = []
         self._on_session = on_session
         self._views: set[str] = set()
@@ -202,7 +203,7 @@ class Catalog:
         return found
 
     def nulled(self) -> dict[str, list[str]]:
-        """Return by session how many values are null because they had another type, in words for each column.
+        """Return by session, in words for each column, how many values are null because they had another type.
 
         Only topics for which a question has asked so far are counted.
         """
@@ -292,7 +293,7 @@ class _Cast:
     files: tuple[str, ...]
 
     def count(self) -> str:
-        """Return the SQL question how many values of each session become null only by the conversion to our type."""
+        """Return the SQL that counts for each session the values that only the conversion to our type makes null."""
         files, column = ", ".join(map(_text, self.files)), _quoted(self.column)
         return (
             f"SELECT {_SESSION}, count(*) FROM read_parquet([{files}], filename=true) "  # noqa: S608 - quoted
@@ -339,6 +340,6 @@ def _is_gone(error: Exception) -> bool:
 
 
 def _one_line(text: str) -> str:
-    """Return the message of DuckDB on one line, without the lines that show the position."""
+    """Return DuckDB's message as one line. Leave out the lines that show a position in the question."""
     lines: Iterable[str] = (line.strip() for line in text.splitlines())
     return printable_lines(" ".join(line for line in lines if line and not line.startswith(("^", "LINE"))))

@@ -1,6 +1,6 @@
 """Counts the messages that a view, a table or a replay leaves out, by key and cause. Pure.
 
-A module that shows recorded messages counts the others here, so that recorded = shown + left out.
+A module that shows recorded messages counts here those that it does not show. So recorded = shown + left out.
 """
 
 from collections import Counter
@@ -85,7 +85,7 @@ def has_unknown_enum(message: Any) -> bool:
 
 
 def may_have_enum(descriptor: Any, above: frozenset[str] = frozenset()) -> bool:
-    """Return True if messages of this type, or messages in them, have an enum."""
+    """Return True if messages of this type, or messages inside them, have an enum."""
     inside = above | {descriptor.full_name}
     return any(
         field.enum_type is not None

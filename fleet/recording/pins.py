@@ -1,7 +1,7 @@
 """Pins of a session: spans of time whose recordings the quota deletes last, each with its cause. Pure.
 
-`pin_watch.py` finds them live, `session.json` stores them, and `quota_choice.py` spares them. If a pin begins
-before its session, that part lies in the session before.
+`pin_watch.py` finds them live, `session.json` stores them, and `quota_choice.py` spares them. If a pin begins before
+its session, its first part lies in the session before.
 """
 
 from collections.abc import Iterable, Mapping
@@ -82,7 +82,8 @@ class PinList:
 
 
 def _is_of_one_cause(one: Pin, other: Pin) -> bool:
-    # Pins of stops are merged although their words differ (they name the sender): the merged pin keeps the first words.
+    # Pins of stops are merged even if their words differ, because these name the sender. The merged pin keeps the first
+    # words.
     return one.cause == other.cause and (one.cause != PinCause.CONDITION or one.words == other.words)
 
 

@@ -14,7 +14,7 @@ MAX_OPEN_GAPS: Final = 256
 MAX_LISTED_GAPS: Final = 1000
 """Maximum number of gaps of one publisher to list. Later gaps are only counted."""
 MAX_EARLY_BACKFILLS: Final = 512
-"""Maximum number of backfilled messages to remember whose originals may still arrive: about twice a publisher's
+"""Maximum number of remembered backfilled messages whose originals may still arrive: about twice a publisher's
 cache."""
 _MODULO: Final = 1 << 32
 _BACKWARD: Final = 1 << 31
@@ -166,7 +166,7 @@ class PublisherSequence:
     """Tracks the recorded messages of one publisher on one key."""
 
     restarts: bool = False
-    """True if the count may restart. A number that neither grows nor fills a gap is then a restart, and otherwise a
+    """True if the count may restart. A number that neither grows nor fills a gap is then a restart. If False, it is a
     duplicate.
 
     The `seq` of a payload never restarts within one `boot_id`. Zenoh's number begins again with each new publisher.

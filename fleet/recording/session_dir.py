@@ -66,7 +66,7 @@ class SessionInfo:
     versions: Mapping[str, str]
     ended: str | None = None
     closed: bool = False
-    """True if the recorder closed the session; False also during recording."""
+    """True if the recorder closed the session. False while it records, and after a crash."""
     messages: int = 0
     drops: Mapping[str, int] = field(default_factory=dict)
     missed: Mapping[str, int] = field(default_factory=dict)
@@ -75,7 +75,7 @@ class SessionInfo:
     recovered: Mapping[str, int] = field(default_factory=dict)
     """Backfilled messages by key. They come later in the file than their sequence numbers suggest."""
     continues: str = ""
-    """Name of the interrupted session that this one continues. Its unwritten messages are backfilled here."""
+    """Name of the interrupted session that this one continues. The messages that it lost are backfilled here."""
     format: int = FORMAT_VERSION
     marks: Sequence[Mapping[str, Any]] = ()
     """Marks set during recording: `time` (ISO 8601), `text`, `by`."""

@@ -46,7 +46,7 @@ def newest_first(place: Path) -> list[Path]:
 
 
 def _begun(info: SessionInfo | None, path: Path) -> tuple[str, float]:
-    """Return the start of a session: by its description, by its name, or by the time of its last change."""
+    """Return the start of a session: from its description, else from its name, else the time of its last change."""
     changed = path.stat().st_mtime
     if info is not None and info.started:
         return re.sub(r"[-:]|\.\d+", "", info.started), changed

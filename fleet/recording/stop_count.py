@@ -11,7 +11,7 @@ from schemas.words import Phase
 
 EVENTS: Final = TOPICS["event/command"]
 MAX_RECENT_IDS: Final = 1000
-"""Maximum number of remembered ids. It is enough, because the events of one command are at most seconds apart."""
+"""Maximum number of remembered ids. So many are enough, because the events of one command are at most seconds apart."""
 
 
 class StopCount:

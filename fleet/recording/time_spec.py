@@ -25,7 +25,7 @@ def at_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> int:
 
 
 def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, int]:
-    """Return begin and end of a time as a person types it for a session from `start_ns` to `end_ns`, ns.
+    """Return begin and end, ns, of a time that a person types for a session from `start_ns` to `end_ns`.
 
     A time of day and a date without a zone are local. A time of day without a day is a time within the session. Raises
     ValueError with the syntax and the range of the session, or with the days if the session has this time of day on
