@@ -27,12 +27,12 @@ CHECK_BURST: Final = 20.0
 CHECK_RATE: Final = 1.0
 """Checks of plans by one person. A person who writes a plan asks for one check in ten seconds."""
 MAX_OPEN_CHECKS: Final = 2
-"""Maximum number of checks of one person that wait. The checks of all persons before them delay the checks of the
-others."""
+"""Maximum number of checks of one person that wait. They delay the checks of other persons."""
 COOLDOWN_S: Final = 15.0
 """Time for which a device whose page was closed cannot open another page."""
-# A person clicks about twice a second. After 30 s of slow Wi-Fi 60 commands arrive at once. The rate is ten times that
-# of a person, but the burst only three times the 60, because each command costs time in every gateway that it asks.
+# A person clicks about twice a second. After 30 s of slow Wi-Fi, 60 commands arrive at once. The rate allows ten times
+# as much as a person, but the burst only three times the 60, because each command costs time in every gateway that it
+# asks.
 COMMAND_BURST: Final = 200.0
 COMMAND_RATE: Final = 20.0
 """Commands of a device that ask gateways, at once and per second. A press counts once, even if it turns."""
@@ -42,7 +42,7 @@ MAX_BUDGETS: Final = 1024
 """Maximum number of remembered persons, devices and strangers. Beyond it, the one that was idle the longest is
 forgotten."""
 MERGE_S: Final = 0.1
-"""Time for which further STOPs of one person are merged into one that follows."""
+"""Time within which further STOPs of one person are merged into one, which follows at its end."""
 TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
 
 TOO_MANY_PLANS: Final = "Too many plans of this person wait for a check. Try again in a few seconds."

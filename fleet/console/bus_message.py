@@ -38,7 +38,7 @@ def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, An
 def is_shown(name: str) -> bool:
     """Return True for the name of a service, and for a name that a car may have.
 
-    Any other name could look like a car's.
+    Another name could mislead: it could look like a car's.
     """
     return name.startswith("@") or keys.is_name(name)
 

@@ -20,10 +20,10 @@ from schemas.rights import Authority, People, PersonRole, binding_pause
 from schemas.words import UNKNOWN, Level, LinkState, Verdict
 
 TREND_WINDOW_S: Final = 240.0
-"""The trend of a battery is measured over this time."""
+"""Time over which the trend of a battery is measured."""
 TREND_SAMPLE_INTERVAL_S: Final = 5.0
 _MIN_TREND_S: Final = 30.0
-"""Minimum time of readings for a trend."""
+"""Minimum time that the readings must cover for a trend."""
 TREND_STEADY_V: Final = 0.03
 """Maximum change of a steady battery. The readings have steps of 0.01 V."""
 MAX_LEDGER_ENTRIES: Final = 60
@@ -33,8 +33,8 @@ SILENT_AFTER_S: Final = topics.TOPICS["state/safety"].stale_after_s or 0.0
 state."""
 MAX_LISTED_CARS: Final = MAX_CARS
 """Maximum number of cars of the running fleet: as many as one message of a page may name."""
-# Without `fleet up` nobody lists the cars. At most fifty gateways were measured on one bus. Anybody on the bus may take
-# a place, and each place costs a card ten times a second, and some 0.1 MB when its lists are full.
+# Without `fleet up`, nobody lists the cars. No measurement had more than fifty gateways on one bus. Anybody on the bus
+# may take a place. Each place costs a card that is made ten times a second, and some 0.1 MB when its lists are full.
 MAX_OTHER_CARS: Final = 64
 """Maximum number of cars that the running fleet does not list."""
 _LINES: Final = ("left_outer", "left_inner", "right_inner", "right_outer")
@@ -94,7 +94,7 @@ class CarView:
 
     @property
     def last_sign_at(self) -> float:
-        """When the newest message came; before the first one, since when the car is in view."""
+        """When the newest message came. Before the first message: when the car came into view."""
         return self._since if self._heard_at is None else self._heard_at
 
     def on_message(self, topic: str, value: Any, now: float, wall_ns: int | None = None) -> None:
@@ -208,7 +208,7 @@ class CarView:
         safety, claim = self.state.newest("state/safety"), self.state.claims(now).motors
         motors: dict[str, Any] = {"state": claim.what, "basis": claim.basis}
         past = claim if claim.is_stale else claim.past
-        if past is not None:  # what is old is told as past, with its age
+        if past is not None:  # show an old claim as a past one, with its age
             motors = {"state": UNKNOWN, "basis": "", "past": past.basic, "past_s": int(past.age_s or 0)}
         shown: dict[str, Any] = {"motors": motors, "hold": None, "lease": None, "estops": []}
         if safety is None:
@@ -312,7 +312,7 @@ class FleetView:
         return self._cars[name]
 
     def _make_room(self, most: int, silent_since: float) -> bool:
-        """Forget cars that are not listed until these are left at most. Return False if one is heard since then."""
+        """Forget unlisted cars until `most` are left, the longest silent first. False if one was heard since then."""
         others = [car for name, car in self._cars.items() if name not in self._listed]
         for car in sorted(others, key=lambda car: car.last_sign_at)[: max(0, len(others) - most)]:
             if car.last_sign_at >= silent_since:
@@ -326,7 +326,7 @@ class FleetView:
         return name in self._cars or name in self._listed
 
     def look_up(self, name: str) -> CarView:
-        """Return the view of a car, an empty one if there is no such car. None is added: a page may name any car."""
+        """Return the view of a car, an empty one if there is no such car. It is not kept: a page may name any car."""
         return self._cars.get(name) or CarView(name, "")
 
     def update_colors(self) -> None:
@@ -344,12 +344,12 @@ class FleetView:
         there = set(present)
         for name in sorted(there - set(self._cars), key=lambda name: name not in self._listed):
             if self._placed(name, now) is None:
-                break  # nor is there a place for those that follow
+                break  # the cars after this one find no place either
         self._make_room(MAX_OTHER_CARS, math.inf)  # some may not be listed any more
         for name, car in self._cars.items():
             car.on_presence(now, present=name in there)
         for name in [each for each in self._cars if each.startswith(TEMPORARY_PREFIX) and each not in there]:
-            del self._cars[name]  # nobody misses it: its car blinked, and got a name of its own
+            del self._cars[name]  # a car that blinked under this name, and has got a name of its own
 
     def as_list(self, now: float) -> list[dict[str, Any]]:
         """Return what a page shows of each car, by name."""

@@ -46,9 +46,9 @@ class Certificate:
 
 
 def names_to_certify(current: Iterable[str], certified: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of a new certificate: the current names, and earlier ones.
+    """Return the names of a new certificate: the current names, then earlier ones.
 
-    So a computer that returns to an earlier network needs no new certificate.
+    With the earlier ones, a computer that returns to an earlier network needs no new certificate.
     """
     return tuple(dict.fromkeys((*current, *certified)))[:MAX_NAMES]
 

@@ -63,7 +63,7 @@ STOP_ANSWER_TIMEOUT_S: Final = 1.0
 """Timeout for the first answer to a STOP by POST. With fifty gateways on two busy cores, the last takes 0.11 s."""
 _MAX_EVENTS: Final = 4096
 _MAX_MERGES: Final = 256
-"""Maximum number of remembered merges of stops, by person and cars."""
+"""Maximum number of remembered merges of stops. Each is for one person and one set of cars."""
 _MAX_STOP_IDS: Final = 256
 """Number of remembered STOP presses. Each press arrives twice: over the socket and by fetch."""
 
@@ -109,7 +109,7 @@ class Console:
         self.budgets = Budgets()
         self._merges: dict[tuple[str, ...], StopMerge] = {}
         self._waiting_stops: dict[tuple[str, str], list[tuple[tuple[str, ...], OnOutcomes]]] = {}
-        """Stops of some cars that wait to be merged, by sender and verb: the cars of each, and the function that gets
+        """Stops of some cars that wait to be merged, by sender and verb. Each has its cars, and the function that gets
         its answer."""
         self._bad_messages = LogLimit()
         self._stop_ids: dict[str, None] = {}
@@ -133,7 +133,7 @@ class Console:
             "echo": self._on_echo,
             "press": self._on_press,
             "release": self._on_release,
-            # A page asks so how long its messages take.
+            # A page measures with it how long its messages take.
             "ping": lambda page, message: page.answer(t="pong", id=message.number("id")),
             Verb.STOP: lambda page, message: self.stop_all(message.text("id"), page.operator),
             Verb.ESTOP: self._on_estop,
@@ -204,7 +204,7 @@ class Console:
         self._plots.on_sample(sample)
 
     def _newest_samples(self) -> Iterator[tuple[float, Sample]]:
-        """Yield the newest messages of the cars, as they were on the bus, each with its age, s."""
+        """Yield the newest samples of the cars from the bus, each with its age, s."""
         name = self._fleet.sync.name
         for car, topic, age_s, message in self._view.newest(time.monotonic()):
             encoding = TOPICS[topic].encoding
@@ -216,7 +216,7 @@ class Console:
         while True:
             now = time.monotonic()
             self._end_presses_of_sleep()
-            if not self._fleet.sync.bus.connected:  # else a press that is still held would drive when it is back
+            if not self._fleet.sync.bus.connected:  # a press still held must not drive when it is back
                 for press in self._presses.on_bus_lost():
                     self._end(press, _BUS_LOST)
             for press in self._presses.expire(now):
@@ -234,7 +234,7 @@ class Console:
             await asyncio.sleep(next_at - loop.time())
 
     def _end_presses_of_sleep(self) -> None:
-        """End every press if this computer slept. Its clock stood still meanwhile, so no echo looks late."""
+        """End every press if this computer slept. Its clock stood still during the sleep, so no echo looks late."""
         if self._sleep.take() > 0:
             for press in self._presses.on_sleep():
                 self._end(press, "The computer of the console slept.")
@@ -388,7 +388,7 @@ class Console:
             raise
         self._last_page += 1
         page = self._pages[self._last_page] = PageLink(self._last_page, send, whose, operator, device)
-        # All guests share one sender, so a stop with this sender may be of another guest.
+        # All guests share one sender, so a stop with this sender may come from another guest.
         names = {"sender": None if whose.is_guest else operator.sender, "fleet": self._fleet.sync.name}
         words = {"plottable": plottable(), "modes": MODE_TEXTS}
         page.answer(t="hello", page=page.number, **names, person=asdict(page.person), **words)
@@ -461,7 +461,8 @@ class Console:
     async def is_stop_taken(self) -> bool:
         """Wait until a gateway has answered the newest STOP of all cars. Return False if none answers in time.
 
-        If a newer STOP follows meanwhile, wait for that one, which stops the same cars. Without any car, do not wait.
+        If a newer STOP comes while this one waits, wait for the newer one, which stops the same cars. If there is no
+        car, do not wait.
         """
         with suppress(TimeoutError):
             async with asyncio.timeout(STOP_ANSWER_TIMEOUT_S):
@@ -477,7 +478,7 @@ class Console:
         Answer each of the waiting stops with the outcomes of its own cars.
         """
         if not (waiting := self._waiting_stops.pop(who, [])):
-            return  # the merge was forgotten, and an earlier call has sent these stops
+            return  # an earlier call has sent these stops, because their merge was forgotten
 
         def answer_all(outcomes: list[dict[str, Any]]) -> None:
             for cars, answer in waiting:

@@ -21,22 +21,24 @@ Address = tuple[str, int]
 ACCEPTS_AT_ONCE: Final = 20
 """Maximum number of connections that are accepted in one turn of the loop. Each takes some 0.05 ms."""
 ACCEPT_PAUSE_S: Final = 0.01
-"""Pause after a full turn. So at most 2000 connections a second are accepted, which take a tenth of a core. The others
-wait in the kernel."""
+"""Pause after a full turn. So at most 2000 connections a second are accepted, in a tenth of a core. The others wait in
+the kernel."""
 SERVE_INTERVAL_S: Final = 0.02
-"""Interval at which a line that has used up its rate is looked at. It is shorter than that between two handshakes of
-one address."""
+"""Interval at which a line that has used up its rate is checked. It is shorter than the interval between two handshakes
+of one address."""
 EXPIRY_INTERVAL_S: Final = 0.25
 """Interval at which silent connections are ended."""
 HANDSHAKE_TIMEOUT_S: Final = 3.0
 """Timeout of a handshake: two round trips over a bad Wi-Fi (0.5 s), one of them sent again after a second."""
-# asyncio's own is 30 s. A page that was closed in a flood never ends TLS: its places, and its buffers, stay taken.
+# asyncio's own timeout is 30 s. If a page was closed in a flood, its client never ends TLS, and keeps its place and its
+# buffers.
 SHUTDOWN_TIMEOUT_S: Final = 2.0
-"""Timeout for the client's end of TLS. It is the same as for the end of the WebSocket before (`fair_socket`)."""
-# The objects of a connection refer to each other, with some 90 kB of buffers. The collector looks at old objects after
-# some 80,000 new ones, which may take an hour: 64 MB of a flood stayed. A collection takes 1 to 3 ms.
+"""Timeout for the client's end of TLS. It is the same as for the end of the WebSocket, which comes before
+(`fair_socket`)."""
+# The objects of a connection refer to each other, and have some 90 kB of buffers. The collector looks at old objects
+# only after some 80,000 new ones. That may take an hour: after a flood, 64 MB stayed. A collection takes 1 to 3 ms.
 COLLECT_AFTER: Final = 100
-"""After this number of handshakes their garbage is collected: 9 MB at most."""
+"""Number of handshakes after which their garbage is collected: 9 MB at most."""
 _READ_BYTES: Final = 4096
 _TLS_HELLO: Final = b"\x16"
 """The first byte of a TLS client: a handshake record (RFC 8446, 5.1)."""
@@ -147,7 +149,7 @@ class Entrance:
                 ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
                 ssl_shutdown_timeout=SHUTDOWN_TIMEOUT_S,
             )
-        except OSError:  # also of TLS, and its timeout: whoever it was has gone
+        except OSError:  # an error of TLS or its timeout, too: the client has gone
             connection.close()
         finally:
             self._room.on_begun(key[0])

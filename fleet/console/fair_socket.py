@@ -29,7 +29,7 @@ TLS is 512 KiB."""
 class FairWebSocket(WebSocketsSansIOProtocol):
     """Parses the received bytes piece by piece.
 
-    The next piece is parsed when the console has taken the messages of the last.
+    The next piece is parsed when the console has taken all messages of the one before.
     """
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # uvicorn's own
@@ -69,7 +69,8 @@ class FairWebSocket(WebSocketsSansIOProtocol):
     async def send(self, message: ASGISendEvent) -> None:
         """Send a message. If it closes the WebSocket, make sure that the connection ends."""
         await super().send(message)
-        # asyncio's TLS forgets a connection whose peer goes while reading is paused. Its place would never become free.
+        # If the peer goes while reading is paused, asyncio's TLS forgets the connection. The place of the connection
+        # would never become free.
         if message["type"] == "websocket.close":
             self._end_later()
 

@@ -84,9 +84,9 @@ class PressBook:
     ) -> tuple[HeldPress, list[HeldPress]]:
         """Begin a press. It replaces the page's earlier press. Raises PressRefused.
 
-        Return the press, and the presses of other pages that it ends, because a lead takes cars from persons who are
-        not leads. An id counts once: a press that is over never begins again, not even by a late message. person: the
-        person at the page. people: those of all these cars.
+        Return the press, and the presses of other pages that it ends: a lead takes cars from persons who are not leads.
+        An id counts once: a press that is over never begins again, not even by a late message. person: the person at
+        the page. people: those of all these cars.
         """
         if press_id <= self._newest_ids.get(client, -1):
             raise PressRefused("This press is over. Press again.")
@@ -155,9 +155,9 @@ class PressBook:
         return self._end(lambda press: bool(cars & set(press.cars)))
 
     def drop_cars_of(self, cars: set[str], person: str, people: People = NO_PEOPLE) -> list[HeldPress]:
-        """End the presses of these cars that a person may end by other commands than a stop.
+        """End the presses of these cars that a command of this person, other than a stop, may end.
 
-        These are the person's own presses. A lead of the cars also ends the presses of persons who are not leads.
+        Those are the person's own presses. A lead of the cars also ends the presses of persons who are not leads.
         """
         sender = Sender(person, Rank.PERSON)
         return self._end(
@@ -179,7 +179,7 @@ class PressBook:
 
 
 def _may_take(sender: Sender, press: HeldPress, people: People) -> bool:
-    """Return True if the sender may take the cars of a press. While it lives, it is a lease of the gateways."""
+    """Return True if the sender may take the cars of a press. A press counts as a lease until it ends."""
     return not LeaseState(people.ranked(press.sender)).refuses(people.ranked(sender), take=False)
 
 

@@ -14,7 +14,7 @@ from schemas.keys import Key
 LIVE_LANES_NS: Final = 900 * 1_000_000_000
 """How far back the live lanes go. A plot shows ten minutes. Five more are kept for a plot that is paused."""
 TICKS_BETWEEN_LANES: Final = 10
-"""The lanes are sent once a second. That is enough to look at, and nobody drives by them."""
+"""Number of ticks from one message with lanes to the next: one second. That is enough, as nobody drives by them."""
 
 
 class LaneFeed(PageFeed):
@@ -63,6 +63,6 @@ class LaneFeed(PageFeed):
     def _show(self, page: PageLink, back_ns: int) -> None:
         now = time.time_ns()
         if page.has_unsent("lanes"):
-            back_ns = LIVE_LANES_NS  # the message that waits may be the first one, which covers everything
+            back_ns = LIVE_LANES_NS  # this message replaces one that waits, perhaps the first, which covers everything
         spans = [span.as_list() for span in (*self._lanes.since(now - back_ns), *self._lanes.silences(now))]
         page.show("lanes", json.dumps({"t": "lanes", "spans": spans}, separators=(",", ":")))

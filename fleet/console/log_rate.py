@@ -9,7 +9,7 @@ LOG_BURST: Final = 50.0
 """Lines of one cause at once. That is more than a person reads, and enough to log every device of a class that
 joins."""
 LOG_RATE: Final = 0.1
-"""Lines of one cause per second after that: one in 10 s, as with the other limits of the log."""
+"""Further lines of one cause per second: one in 10 s, as with the other limits of the log."""
 
 
 class LogRate(logging.Filter):

@@ -17,7 +17,7 @@ from schemas.bus import Latest, Sample
 from schemas.keys import SIMULATOR, Key
 
 TICKS_BETWEEN_MAPS: Final = 2
-"""Five maps a second look like motion to the eye, and a map is only looked at."""
+"""Five maps a second are enough: they look like motion, and nobody drives by them."""
 _MAX_MAP_KEYS: Final = 1024
 
 

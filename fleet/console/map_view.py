@@ -24,7 +24,7 @@ TRAIL_STEP_S: Final = 0.25
 TRAIL_STEP_M: Final = 0.01
 """Minimum distance between two points of a trail, so that a car that stands still adds none."""
 SHOWN_S: Final = 30.0
-"""For this time the last place of a car is shown, with its age."""
+"""Time for which the last place of a car is shown, with its age."""
 MAX_CORNERS: Final = 2000
 """Maximum number of walls, corners of the line, and things of a floor. A world file may have a tenth of each."""
 _MAX_MAP_NAME_LENGTH: Final = 64

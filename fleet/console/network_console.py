@@ -69,10 +69,7 @@ class LimitedListener(socket.socket):
         return made
 
     def admit(self, connection: socket.socket, address: tuple[str, int]) -> bool:
-        """Keep a connection that begins TLS, perhaps in place of another one.
-
-        Return False if there are too many connections.
-        """
+        """Keep a connection that begins TLS. Another one may have to end for it. Return False if there are too many."""
         self._forget_closed()
         admitted, ended = self.limit.admit(address, address[0], time.monotonic())
         if ended is not None:
@@ -116,7 +113,7 @@ class Lan:
     # The people file is changed in threads, because waiting for its lock on the loop would delay a STOP.
 
     def __init__(self, listener: LimitedListener, people: PeopleFile, listed: People = NO_PEOPLE) -> None:
-        """Begin. `listed` are the people of the fleet as far as known. Later its gateways say who they are."""
+        """Begin. `listed` are the people of the fleet, as far as they are known. Its gateways name them later."""
         self.listener = listener
         self.people = people
         self.port: int = listener.getsockname()[1]
@@ -134,7 +131,7 @@ class Lan:
         self._failures = LogLimit()
         self._shared_cookies = LogLimit()
         self._connected: dict[int, tuple[str, str, Callable[[], object], Callable[[], object]]] = {}
-        """By number of the socket: its device, its address, and the functions that close it for good and for a
+        """By number of the socket: its device, its address, and two functions. One closes it for good, one only for a
         moment."""
         self._last_socket = 0
         self.people.serve()
@@ -183,8 +180,8 @@ class Lan:
     ) -> tuple[str | None, float, PagePerson | None]:
         """Pair a device. Return its cookie, or None and the time to wait before the next try (s). Raises ClassFull.
 
-        cookie_before: the cookie of a device that is paired already. Its device keeps its person if the code is that of
-        a class.
+        cookie_before: the cookie that the device has already, if any. If the code is that of a class, a paired device
+        keeps its person.
         """
         now, address = time.monotonic(), client[0]
         if (wait_s := self.guesses.wait_s(address, now)) > 0:
@@ -241,7 +238,7 @@ class Lan:
             )  # fmt: skip
 
     def on_refusal(self, words: str) -> None:
-        """Log a refused request. Of a flood of refused requests, log only some."""
+        """Log a refused request. In a flood of refused requests, log only some."""
         if (shown := self._refusals.words(words, time.monotonic())) is not None:
             log.warning("%s", shown)
 

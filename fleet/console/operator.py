@@ -19,7 +19,7 @@ from schemas.bus import Failure
 from schemas.commands import COMMANDS, Verb
 from schemas.words import Motion, Phase, Reason
 
-# The gateway is the watchdog outside our loop: if the loop blocks, the last drive expires.
+# The gateway is the watchdog of our loop: if the loop blocks, the last drive expires there.
 DRIVE_TTL_S: Final = 0.5
 """Duration of each drive of a press. If no further drive follows, the gateway stops the car."""
 STREAM_INTERVAL_S: Final = 0.15
@@ -67,14 +67,15 @@ class ConsoleOperator:
             return
         self._streams[(press.client, press.id)] = now, count + 1, press.cars
         request = drive_request(press.motion, DRIVE_TTL_S)
-        # Only the first drive may start a car. So if the bus hangs for longer than a drive lasts, the press is over.
+        # Only the first drive of a press may start a car. So a press is over if the bus hangs for longer than a drive
+        # lasts.
         request.message.continues = count > 0
         self._stream(press.cars, request, STREAM_MAX_AGE_S, count + 1)
 
     def end_press(self, press: HeldPress, cars: Iterable[str] | None = None) -> None:
         """Stop the cars of a press, or some of them.
 
-        Do so at once in the stream, and again by a query, which has an outcome.
+        Stop them at once in the stream of drives, then by a query, which has an outcome.
         """
         stopped = tuple(press.cars if cars is None else cars)
         _, count, _ = self._streams.pop((press.client, press.id), (0.0, 0, ()))
@@ -104,7 +105,7 @@ class ConsoleOperator:
         if (
             press.client,
             press.id,
-        ) not in self._streams:  # this query may have overtaken the end of the press in the stream
+        ) not in self._streams:  # our query may have overtaken the end of the press in the stream
             driven = {
                 car for _, _, cars in self._streams.values() for car in cars
             }  # driven by a press that has replaced this one

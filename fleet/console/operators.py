@@ -12,7 +12,7 @@ from schemas.keys import person_of
 from schemas.words import Rank
 
 IDLE_CLIENT_S: Final = 5.0
-"""Time for which the client of a person without a page stays open, because a page may only be loading again."""
+"""Time for which a person's client stays open without a page, because the page may only be reloading."""
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""The messages to one page. Answers wait in a bounded queue. Of ticks and of states only the newest waits.
+"""The messages to one page. Answers wait in a bounded queue. Only the newest tick and the newest state wait.
 
 A page that does not read does not delay any other page.
 """

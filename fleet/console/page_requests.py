@@ -1,6 +1,6 @@
 """The messages of a page, checked and turned into command requests. Pure.
 
-A page is not trusted. So each value is checked here, and whether the command is carried out is decided by the gateway.
+A page is not trusted. So each value is checked here, and the gateway decides whether the command is carried out.
 """
 
 import json

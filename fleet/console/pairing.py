@@ -83,7 +83,7 @@ class PagePerson:
 
     @property
     def acts_as(self) -> str:
-        """The person of its client on the bus. All guests share one client, because they only stop."""
+        """The name of the person's client on the bus. All guests share one client, because they only stop."""
         return GUEST if self.is_guest else self.name
 
 
@@ -102,7 +102,7 @@ class PairingCode:
     def is_open(self, now: float) -> bool:
         """Return True until the lifetime of the code has passed.
 
-        A clock that was set back to before its beginning ends it, too.
+        The code also ends if the clock is set back to before its start.
         """
         return 0 <= now - self.issued_s < (CLASS_LIFETIME_S if self.person.is_guest else CODE_LIFETIME_S)
 
@@ -259,10 +259,7 @@ class PeopleBook:
         return replace(device, person=self._ranked(device.person))
 
     def _ranked(self, person: PagePerson) -> PagePerson:
-        """Return the person.
-
-        If their code said lead, but the fleet does not list them as a lead, their rank is person.
-        """
+        """Return the person, with rank `person` if their code said lead, but the fleet does not list them as a lead."""
         is_lead = self.leads is None or person.name in self.leads
         return person if is_lead or person.rank != Rank.LEAD else replace(person, rank=Rank.PERSON)
 

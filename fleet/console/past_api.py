@@ -24,17 +24,17 @@ from fleet.console.worker import TooManyQuestions, Worker
 from schemas.keys import is_name
 
 LANES_TIMEOUT_S: Final = 120.0
-"""Timeout of the lanes of a recording. An hour of twenty cars takes 3 s, and so does a day of three cars. With the
-lowest share of a processor they take ten times as long."""
+"""Timeout of the lanes of a recording. An hour of twenty cars takes 3 s, as does a day of three cars. Both take ten
+times as long with the lowest share of a processor."""
 MOMENT_TIMEOUT_S: Final = 20.0
 """Timeout of a moment. It takes 0.2 s with twenty cars, and ten times as long with the lowest share of a processor. The
 start of the process takes up to 10 s."""
 IDLE_READER_S: Final = 300.0
-"""The processes end this time after the last question. Before, a person may be looking at what a jump shows."""
+"""Time after the last question at which the processes end. Until then, a person may be looking at what a jump shows."""
 MAX_OPEN_LOOKS: Final = 2
 """Maximum number of questions of one person that wait. A page asks for only one moment at a time."""
 _MAX_MS: Final = 2**53
-"""Maximum of a number that JavaScript represents exactly."""
+"""Largest whole number up to which JavaScript represents all exactly."""
 _TOO_MANY: Final = "Other looks of this person at recordings have no answer yet. Try again in a few seconds."
 
 

@@ -19,11 +19,10 @@ from schemas.keys import COORDINATOR
 from schemas.topics import CAR_TOPICS
 
 DETAIL_BEFORE_NS: Final = 60_000_000_000
-"""Commands and frames of one car are shown from this time before the moment. A command ends within seconds. A page
-shows 60 frames, which a car that reports once a second sends in a minute."""
+"""How far before the moment the commands and frames of one car are shown. A command ends within seconds. A page shows
+60 frames: a car that reports once a second sends them in a minute."""
 DECISIONS_BEFORE_NS: Final = 600_000_000_000
-"""Decisions are shown from this time before the moment, the newest about each car. They are published only on
-change."""
+"""How far before the moment decisions are shown, the newest about each car. They are published only on change."""
 PLOT_SLOTS: Final = 600
 """Maximum number of values of one series. A page draws no more (static/plots-page.js)."""
 _TOPICS: Final = frozenset(topic.name for topic in CAR_TOPICS)

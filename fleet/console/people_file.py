@@ -45,7 +45,7 @@ class PeopleFile:
         return self._book
 
     def change(self, function: Callable[[PeopleBook], tuple[PeopleBook, T]]) -> T:
-        """Replace the book by the first value that the function returns, and return the second. Raises OSError."""
+        """Replace the book by the first value that the function returns. Return its second value. Raises OSError."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.with_name(f"{self.path.name}.lock").open("a") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -20,10 +20,10 @@ from schemas.bus import Sample
 from schemas.yaml_document.document import BadFile
 
 PLAN_CHECK_TIMEOUT_S: Final = 30.0
-"""Timeout of a check. The worst plan of 60 kB takes 2 s, and ten times as long with the lowest share of a busy
-processor. The process starts as fast as a coordinator: in 1 s, on a busy machine in 10 s."""
+"""Timeout of a check. The worst plan of 60 kB takes 2 s, or 20 s with the lowest share of a busy processor. The process
+itself starts in 1 s, on a busy machine in 10 s, as a coordinator does."""
 IDLE_CHECKER_S: Final = 60.0
-"""The process ends this time after the last check. A person who writes a plan checks it from time to time."""
+"""Time after the last check at which the process ends. A person who writes a plan checks it from time to time."""
 
 
 class PlanChecks:

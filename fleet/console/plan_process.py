@@ -28,7 +28,7 @@ class PlanProcess:
         self._starting = asyncio.Lock()
 
     async def set_plan(self, text: str, ask: Callable[[], Awaitable[tuple[bool, str] | None]]) -> tuple[bool, str]:
-        """Put a plan in force, and start a coordinator if there is none. Return its answer, or what went wrong.
+        """Put a plan in force, and start a coordinator if there is none. Return the answer, or what went wrong.
 
         ask: asks the coordinator to put the plan in force. It returns None if there is no coordinator.
         """

@@ -17,7 +17,7 @@ from schemas import keys, topics
 from schemas.bus import BusError, Sample
 
 _MAX_PLOT_SAMPLES: Final = 16_384
-# A gateway answers `busy` to whoever asks when some questions wait there. Pages must not take all these places.
+# A gateway lets only a few questions wait, and answers `busy` to any further one. Pages must not take all these places.
 MAX_HISTORY_QUESTIONS: Final = 2
 """Maximum number of queries for history at a time, of all pages. Each page has at most one."""
 MAX_PLOT_S: Final = 600
@@ -34,7 +34,7 @@ class PlotFeed(PageFeed):
         self._spawn = spawn
         self._buffers: dict[int, PlotBuffer] = {}
         self._wanted: dict[int, tuple[PlotBuffer, float]] = {}
-        """The newest plot of each page whose history is not being read yet, and how far back it goes, s."""
+        """The newest plot of each page that still waits for its history, and how far back it goes, s."""
         self._reading: set[int] = set()
         """The pages whose history is being read."""
         self._questions = asyncio.Semaphore(MAX_HISTORY_QUESTIONS)

@@ -7,7 +7,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 
 BODY_TIMEOUT_S: Final = 10.0
-"""Timeout of a body, counted from when we first wait for it."""
+"""Timeout of a body, from the first wait for it."""
 
 
 async def read_start(request: Request, size: int) -> bytes:

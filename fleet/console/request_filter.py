@@ -31,7 +31,7 @@ _HEADERS: Final = (
 COOKIE_PATHS: Final = ("/", "/hello")
 """Where a page gets its cookie. `/hello` renews it after a restart of the console."""
 STOP_PATH: Final = "/stop"
-"""The only POST that needs no cookie, because a stop must not fail for an old cookie. Host and Origin are checked."""
+"""The only POST that needs no cookie: an old cookie must not make a stop fail. Host and Origin are checked."""
 
 PERSON: Final = "fleet.person"
 """Where the scope of a request from the network has its `PagePerson`."""
@@ -128,7 +128,7 @@ class NetworkGuard(Guard):
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> str:
         host = headers.get("host", "").lower()
-        # The address at which the connection arrived is always one of ours, and no other name can stand for an address.
+        # The address at which the connection arrived is ours. An attacker's name cannot look like an IP address.
         address, port = scope["server"]
         ours = {f"{name}:{port}" for name in (*self._names(), address)}
         if port == _HTTPS_PORT:

@@ -26,8 +26,8 @@ def refusals(car: str, authority: Authority, sender: str) -> dict[Right, str]:
 def management_refusal(cars: Mapping[str, Authority], sender: str) -> str:
     """Return why this person may not start and stop the recorder and plans. Empty if they may.
 
-    Both concern the whole fleet. The coordinator and the recorder decide by the same rule, so a page can show the
-    refusal beforehand.
+    The recorder and plans are for the whole fleet. The coordinator and the recorder decide by the same rule, so a page
+    can show the refusal beforehand.
     """
     return fleet_refusal(People.merged(each.people for each in cars.values()), person_of(sender))
 
@@ -35,7 +35,7 @@ def management_refusal(cars: Mapping[str, Authority], sender: str) -> str:
 def rights_of(sender: str, cars: Mapping[str, Authority]) -> dict[str, Any]:
     """Return the words of what is refused to this sender, by car and action, and for the whole fleet.
 
-    `mine` are the cars that the people of the fleet and loans give to this sender, whatever else refuses now.
+    `mine` are the cars that this sender may drive by the people of the fleet and by loans, whatever else refuses now.
     """
     by_car = {car: _cached(car, authority, sender) for car, authority in cars.items()}
     fleet = {str(right): next(_common(by_car, right), "") for right in (Right.PAUSE, Right.UNPAUSE)}
@@ -60,7 +60,7 @@ def _is_mine(authority: Authority, sender: str) -> bool:
 
 
 def _common(by_car: Mapping[str, Mapping[Right, str]], right: Right) -> Iterator[str]:
-    """Yield the words of the first car if every car refuses it."""
+    """If every car refuses this right, yield the words of the first car."""
     if by_car and all(right in refused for refused in by_car.values()):
         yield next(iter(by_car.values()))[right]
 

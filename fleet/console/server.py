@@ -68,8 +68,7 @@ _CLOSE_TIMEOUT_S: Final = 2.0
 """Timeout for open connections when the console ends."""
 
 _LOGGERS: Final = ("fleet", "asyncio", "uvicorn.error")
-"""The loggers that a flood of connections causes to write: asyncio logs each write to a TLS connection that has
-gone."""
+"""Loggers that a flood of connections could fill: asyncio logs each write to a TLS connection that has gone."""
 
 log = logging.getLogger("fleet")
 
@@ -202,7 +201,7 @@ async def serve(
         each.add_done_callback(end)
     try:
         on_ready()
-        # Imported objects live as long as the process. Freeze them, so that the collections of `entrance` do not visit
+        # Imported objects live as long as the process. Freeze them, so that the garbage collections of `entrance` skip
         # them.
         gc.collect()
         gc.freeze()
@@ -225,11 +224,11 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
     async def stop(request: Request) -> Response:
         stop_id = request.query_params.get("id", "")[:_MAX_STOP_ID_LENGTH]
         person = request.scope.get(PERSON)
-        # If the stop of a person without an open page had the name of a lead, this person could not drive the cars
+        # A stop must have the name of the person who stops. Under a lead's name, the person could not drive the cars
         # afterwards.
         named = replace(stop_request(), sender=console.sender_of(person))
         console.stop_all(stop_id, console.operator_of(person), named)
-        if not await console.is_stop_taken():  # the page sends it again for as long as it counts
+        if not await console.is_stop_taken():  # the page sends its STOP again for as long as it counts
             return JSONResponse({"ok": False, "words": STOP_NOT_TAKEN}, 503)
         return Response(status_code=204)
 
@@ -373,7 +372,7 @@ async def _joined(console: Console, socket_: WebSocket, lan: "Lan | None") -> As
 
 
 async def _carry_out_stops(socket_: WebSocket, text: str, on_text: Callable[[str], None]) -> None:
-    """Carry out the stops among the messages that came after the one that exceeded the budget. Drop the rest."""
+    """Carry out the stops among the messages that came after the budget was exceeded. Drop the rest."""
     with suppress(TimeoutError):
         async with asyncio.timeout(_LAST_READ_S):
             for _ in range(_LAST_READ_MESSAGES):

@@ -1,4 +1,4 @@
-"""Runs `fleet` in processes for the sessions page: a few at a time, one at most for each person, at low priority."""
+"""Runs `fleet` in processes for the sessions page: a few at a time, at most one for each person, at low priority."""
 
 import asyncio
 import os

@@ -49,7 +49,7 @@ class SessionsApi:
         self._refusal = refusal
         self._jobs = SessionJobs()
         self._listing: asyncio.Task[tuple[int, str, str]] | None = None
-        """The process that lists the sessions. All pages that ask meanwhile share its result."""
+        """The process that lists the sessions. All pages that ask while it runs share its result."""
         self._scratch: Path | None = None
         self._exports: dict[str, Path] = {}
         self._number = 0
@@ -225,7 +225,7 @@ def session_row(listed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _moment(text: object) -> dict[str, int | None]:
-    """Return a time as ms since the epoch, with this computer's offset from UTC then, s. None if it is not a time."""
+    """Return a time (ms since the epoch), and this computer's offset from UTC then (s). None if it is not a time."""
     try:
         at_s = datetime.fromisoformat(str(text)).timestamp()
         return {"at_ms": round(at_s * 1000), "zone_s": time.localtime(at_s).tm_gmtoff}

@@ -1,7 +1,7 @@
 """The course of a STOP, car by car: stopping, shown, sent, not reached, or moving again. Pure: time is an argument.
 
 Each car has a row of its own. The row of a car that moves again says so as long as the car moves. Then the row is
-closed, because whatever ended that motion was not this STOP.
+closed, because something other than this STOP ended that motion.
 
 `now` is monotonic, s. `at_ms` is the clock of the console, ms since the epoch: pages show it.
 """
@@ -50,7 +50,7 @@ class StopReport:
         if event.phase in (Phase.COMPLETE, Phase.SENT):
             self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))
         is_stopped = event.phase == Phase.COMPLETE or (event.phase == Phase.SENT and event.basis)
-        # A car that was thought not reached may still be stopped later by this STOP.
+        # This STOP may still stop a car later that it seemed not to reach.
         if self._is_over(car) and not (is_stopped and self._cars[car]["state"] == Phase.FAILED):
             return
         match event.phase:
@@ -66,7 +66,7 @@ class StopReport:
     def on_safety(self, car: str, safety: Any, now: float) -> None:
         """Handle a new state/safety.
 
-        A car that was not reached may be stopped by its own gateway later, and one that stood may move again.
+        The gateway of a car that was not reached may stop the car later. A car that stood may move again.
         """
         state = self._cars[car]["state"] if car in self._cars else ""
         stamp_ns = messages.stamp_ns(safety.stamp)

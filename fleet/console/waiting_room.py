@@ -1,11 +1,11 @@
 """The connections from the network that were accepted and wait for TLS. Pure: time is an argument (s, monotonic).
 
-A TLS handshake takes some milliseconds of the loop that stops the cars, so each address may begin only a limited
-number. But a whole class has one address behind its access point, and one client that floods must not lock the rest of
-the class out. So connections over the rate are not closed: they wait in the line of their address. A connection that
-has sent nothing loses its place first, the oldest of them before the others, because an honest client sends its TLS
-hello at once. Connections with a hello are served in order, so a client that connects again and again waits behind
-everybody else each time.
+A TLS handshake takes some milliseconds of the loop that stops the cars, so each address may begin only a limited number
+of them. But a whole class has one address behind its access point, and one client that floods must not lock the rest of
+the class out. So connections over the rate are not closed: they wait in the line of their address. If places run out,
+the oldest connection that has sent nothing loses its place first, because an honest client sends its TLS hello at once.
+Connections with a hello are served in order, so a client that connects again and again waits behind everybody else each
+time.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -25,13 +25,13 @@ MAX_HANDSHAKES_PER_ADDRESS: Final = 16
 """Maximum number of unfinished handshakes of one address. It is less than the number of strangers that an address may
 have."""
 MAX_WAITING_PER_ADDRESS: Final = 160
-"""Maximum number of connections in one line. A flood of 1000 a second without a hello leaves an honest client 0.16 s to
-send its hello."""
+"""Maximum number of connections in one line. In a flood of 1000 connections a second without a hello, an honest client
+has 0.16 s to send its hello."""
 MAX_WAITING: Final = 224
 """Maximum number of connections in all lines. Together with the open connections they are fewer than the 1024 files of
 a process."""
 HELLO_TIMEOUT_S: Final = 10.0
-"""Timeout of a connection that sends nothing. It is that of a stranger (`connection_limit`)."""
+"""Timeout of a connection that sends nothing: the same as for a stranger (`connection_limit`)."""
 MAX_ADDRESSES: Final = 1024
 """Maximum number of remembered addresses without a connection. Beyond it, an idle address is forgotten."""
 
@@ -61,10 +61,7 @@ class WaitingRoom:
     _total: TokenBucket = field(default_factory=lambda: TokenBucket(TOTAL_RATE, TOTAL_BURST))
 
     def add(self, key: Hashable, address: str, now: float) -> Hashable | None:
-        """Add a connection.
-
-        Return the key of a connection that loses its place for it, which may be the new one itself.
-        """
+        """Add a connection. Return the key of one that loses its place for it, perhaps of the new one itself."""
         line = self._lines.setdefault(address, _AddressLine())
         line.silent[key] = now
         self._forget_idle()

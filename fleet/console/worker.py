@@ -81,7 +81,7 @@ class Worker:
 
     async def _answer(self, line: bytes) -> dict[str, Any] | None:
         """Return the answer of the process, or None if the process has died."""
-        # If nobody waited for this answer, it would be taken for the answer to the next question.
+        # Somebody must wait for this answer, or it would be taken for the answer to the next question.
         process, self._process = self._process or await self._start(), None
         answered = False
         try:
