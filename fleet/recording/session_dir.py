@@ -75,7 +75,7 @@ class SessionInfo:
     recovered: Mapping[str, int] = field(default_factory=dict)
     """Backfilled messages by key. They come later in the file than their sequence numbers suggest."""
     continues: str = ""
-    """Name of the interrupted session that this one continues. The messages that it lost are backfilled here."""
+    """Name of the interrupted session that this one continues. Messages that it could not write are backfilled here."""
     format: int = FORMAT_VERSION
     marks: Sequence[Mapping[str, Any]] = ()
     """Marks set during recording: `time` (ISO 8601), `text`, `by`."""
