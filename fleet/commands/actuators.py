@@ -1,6 +1,6 @@
-"""`fleet led, light, servo, arm, speed, fan`, and subcommands that have no function here, such as `whistle`.
+"""`fleet led, light, servo, arm, speed, fan`, and others, such as `whistle`.
 
-The latter are made from their rows in `schemas.commands`.
+The others have no function here: they are made from their rows in `schemas.commands`.
 """
 
 import re
@@ -104,7 +104,7 @@ def led(client: Fleet, cars: tuple[str, ...], color: tuple[int, int, int], *, as
 @json_option
 @with_client
 def light(client: Fleet, cars: tuple[str, ...], request: CommandRequest, *, as_json: bool) -> None:
-    """Set the light of a car to a color or off. For any other color (#rrggbb) set its LED instead."""
+    """Set the light of a car to a color or off. With any other color (#rrggbb), this sets its LED instead."""
     carry_out(client, request, cars, as_json=as_json)
 
 

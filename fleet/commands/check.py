@@ -183,7 +183,7 @@ class _Checks:
 def recognize(text: str) -> FileKind:
     """Return the kind of a file by its fields.
 
-    If no field is known, it counts as a fleet file, and is reported as one.
+    If it has no known field, it counts as a fleet file.
     """
     try:
         found: Any = yaml.safe_load(text)

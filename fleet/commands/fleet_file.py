@@ -1,4 +1,4 @@
-"""`fleet init, schema`: writes and describes fleet files. Has parts for commands that read them. Moves no car."""
+"""`fleet init, schema`: writes and describes fleet files. Other commands read them with its functions. No car moves."""
 
 import json
 import re
@@ -241,7 +241,7 @@ def confirm(words: str, instead: str = "") -> bool:
 
 
 def _error_without_answer(error: click.Abort, instead: str) -> click.Abort | click.ClickException:
-    """Return the error for a question without an answer. After Ctrl-C, return the same Abort."""
+    """Return the error for a question without an answer. An Abort after Ctrl-C is returned unchanged."""
     if isinstance(error.__context__, KeyboardInterrupt):
         return error
     click.echo()

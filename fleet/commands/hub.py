@@ -159,7 +159,7 @@ def invite(
         if car and invited in store.known:
             _stop_first(endpoint, car)
         with cli_errors(), _disk_errors():
-            store.reserve(invited)  # last, when this computer listens, because this ends an earlier certificate
+            store.reserve(invited)  # do this last, once we listen: it ends an earlier certificate
         if port != JOIN_PORT:
             here = f"{here}:{port}"
         if as_json:
@@ -245,7 +245,7 @@ examples:
     "--at",
     "site",
     metavar="HOST[:PORT]",
-    help="Use the hub of a site, which has this address: 127.0.0.1 on the computer of that hub.",
+    help="Use the hub of a site, at this address (127.0.0.1 on the computer of that hub).",
 )
 def join_hub(words: tuple[str, ...], site: str | None) -> None:
     """Join the hub on another computer, with the code that `fleet hub invite` shows there.

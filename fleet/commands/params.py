@@ -139,7 +139,7 @@ class CarNames(click.ParamType[tuple[str, ...]]):
         return names
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        """Return connected cars, and the words of the argument after them: `fleet drive red fo`."""
+        """Return connected cars, and words for the next argument, as in `fleet drive red fo`."""
         found = [CompletionItem(name) for name in complete_cars(ctx, param, incomplete)]
         if isinstance(param, click.Argument):
             words = [each for each in ctx.command.params if isinstance(each, click.Argument) and each is not param]

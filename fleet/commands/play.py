@@ -53,7 +53,7 @@ Look at it with `fleet list --fleet fleet-replay`, or run your own program on it
     "--skip-gaps",
     "skip_gaps_s",
     type=Duration(_DAY_S),
-    help="Shorten gaps between messages that are longer than DURATION to DURATION, such as 5s.",
+    help="Shorten each longer gap between messages to DURATION, such as 5s.",
 )
 @click.option(
     "--cars-only", is_flag=True, help="Leave out the messages of the coordinator, the recorder and the supervisor."
@@ -179,7 +179,7 @@ def _time(option: str, text: str, start_ns: int, end_ns: int) -> int:
 
 
 def _fleets(session: "Session", about: "SessionSummary") -> list[str]:
-    """Return the recorded fleet's name, then other fleets' names in keys. Without any, return the default fleet."""
+    """Return the recorded fleet's name, then those of other fleets in keys, or the default fleet if there is none."""
     described = [session.description.fleet] if session.description is not None and session.description.fleet else []
     of_keys = (key.fleet for key in map(keys.parse, about.keys) if key is not None)
     return list(dict.fromkeys([*described, *of_keys])) or [keys.DEFAULT_FLEET]

@@ -133,7 +133,7 @@ conditions under `pin:` in the fleet file, are removed last. Files of marked ses
     "--site",
     default="",
     metavar="SITE",
-    help="Record at this site, beside the fleet's main recorder, which answers all commands while it can be reached.",
+    help="Record at this site, beside the fleet's main recorder. That one answers all commands while it is reachable.",
 )
 @connect_option()
 @fleet_option()

@@ -63,7 +63,7 @@ STOP_ANSWER_TIMEOUT_S: Final = 1.0
 """Timeout for the first answer to a STOP by POST. With fifty gateways on two busy cores, the last takes 0.11 s."""
 _MAX_EVENTS: Final = 4096
 _MAX_MERGES: Final = 256
-"""Maximum number of remembered merges of stops. Each is for one person and one set of cars."""
+"""Maximum number of remembered merges of stops, by sender and verb."""
 _MAX_STOP_IDS: Final = 256
 """Number of remembered STOP presses. Each press arrives twice: over the socket and by fetch."""
 
