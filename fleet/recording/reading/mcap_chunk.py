@@ -27,7 +27,8 @@ Readings compress by a factor of 3 to 20."""
 BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 
 Record = tuple[int, int, int, int, bytes]
-"""Message: channel, sequence, log time, publish time, payload. Channel or schema: minus its opcode, 0, 0, 0, body."""
+"""A message has channel, sequence, log time, publish time, payload. A channel or schema has minus its opcode, 0, 0, 0,
+body."""
 
 
 @dataclass(frozen=True, slots=True)

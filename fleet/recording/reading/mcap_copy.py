@@ -14,8 +14,8 @@ from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, Row
 SESSION_METADATA: Final = "session"
 """Name of the metadata record that names the session of which a file is a part."""
 CHUNK_NS: Final = 1_000_000_000
-"""Maximum time span of a chunk, as in the recorder's files. So reading a short part decompresses little more than
-it."""
+"""Maximum time span of a chunk, as in the recorder's files. So reading a short part decompresses little more than that
+part."""
 
 
 class McapCopy:

@@ -1,4 +1,4 @@
-"""Scans an MCAP file without a valid index record by record, past damage. Reads no message.
+"""Scans an MCAP file that has no valid index, record by record and past damage. Reads no message.
 
 A damaged length could lead anywhere. So the scan trusts a record only if another record follows it and no intact chunk
 lies inside it. Otherwise the scan reports the damage and continues at the next intact chunk.

@@ -54,7 +54,7 @@ class NoSession(Exception):
 
 
 def _near(path: Path) -> str:
-    """Return the question whether a likely session was meant, with a blank at its end. Empty if no name is near."""
+    """Return a question that proposes a likely session, with a blank at its end. Empty if no name is near."""
     place = sessions_place()
     there = sorted(each.name for each in place.iterdir() if each.is_dir()) if place.is_dir() else []
     near = did_you_mean(path.name, [LATEST, *there])
@@ -212,7 +212,7 @@ class Session:
     def extras(self) -> list[Extra]:
         """Return the intact attachments and metadata records, each once. `lost_extras` then describes the damaged ones.
 
-        The record in each of our own files that names its session is left out.
+        The record that names the session, which each of our own files has, is left out.
         """
         found: list[Extra] = []
         self.lost_extras = ""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import pyarrow as pa  # type: ignore[import-untyped]  # it has no stubs
 
 TIME: Final = "publish_time"
-"""Column by which tables are sorted and joined. For all messages of a car it is by the clock of the car's gateway."""
+"""Column by which tables are sorted and joined. In all messages of a car, it is by the clock of the car's gateway."""
 _NOT_JOINED: Final = frozenset({"key", "car", "log_time", "sequence", "seq", "boot_id"})
 
 

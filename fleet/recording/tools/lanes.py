@@ -121,7 +121,7 @@ class Lanes:
             yield from (span for span in spans if span.end_ns >= at_ns)
 
     def silences(self, now_ns: int) -> Iterator[LaneSpan]:
-        """Yield a loss for each car that has not been heard for too long by now. It may never be heard again."""
+        """Yield a loss for each car that has been silent for too long by now. It may never be heard again."""
         for car, heard_ns in sorted(self._heard_ns.items()):
             if now_ns - heard_ns > HELD_NS:
                 yield LaneSpan(car, Lane.LOSS, heard_ns, now_ns, NOT_HEARD, bad=True)

@@ -40,7 +40,7 @@ RANGE_MIN_M: Final = 0.01
 RANGE_MAX_M: Final = 12.0
 """Range of the ultrasonic sensor by the message `fleet.v1.Range`."""
 NOT_MEASURED: Final = -1.0
-"""First element of a covariance in sensor_msgs/Imu: the message has no such value."""
+"""First element of a covariance in sensor_msgs/Imu, if the message does not have the value."""
 INT32_MAX: Final = 2**31 - 1
 _NAN: Final = float("nan")
 _LOG_LEVELS: Final = {1: 10, 2: 20, 3: 30, 4: 40, 5: 50}

@@ -231,7 +231,7 @@ def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[t
 
 
 def _state(session: Session, read: Session) -> tuple[SessionState, str]:
-    """Return the state and why. `read` is the damage of the files that have no usable index, and were read."""
+    """Return the state, and its reason. `read` is the damage of the files that have no usable index, and were read."""
     description = session.description
     if session.damage:
         return SessionState.DAMAGED, session.damage_words

@@ -51,7 +51,8 @@ _NOTE: Final = "damage"
 """Name of the file that describes the parts of the session that could not be read."""
 _FOREIGN: Final = ".foreign.parquet"
 _OPEN: Final = "recording"
-"""Name of the empty file that says that the session was being recorded. If it was not closed since, it was cut."""
+"""Name of the empty file that says that the session was being recorded. If the recorder has not closed it since, the
+session was cut."""
 _LEFT_OUT: Final = "left_out"
 """Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
 _STAMP: Final = "stamp-"
@@ -252,7 +253,7 @@ def _homes(session: Path) -> Iterator[Path]:
     home = session if session.is_dir() else session.parent / f".{session.name}"
     yield home
     owner = hashlib.sha256(str(home.absolute()).encode()).hexdigest()[:12]
-    # Each user has an own directory, because that of another user cannot be written.
+    # Each user has their own directory, because that of another user cannot be written.
     user = f"zenoh-car-fleet-tables-{os.getuid() if hasattr(os, 'getuid') else 0}"
     yield Path(tempfile.gettempdir()) / user / owner / session.name
 

@@ -97,9 +97,9 @@ def _sum(counts: Iterable[object]) -> int | None:
 def cut(
     session: Session, out: Path, selection: Selection, cars: Iterable[str] = (), with_progress: Progress = iter
 ) -> int:
-    """Write a part to a new session, and return its number of messages. With `cars`: messages of these and of services.
+    """Write a part to a new session, and return its number of messages.
 
-    Raises Exists, OSError, and NoSession if the part is empty.
+    With `cars`: only messages of these cars and of services. Raises Exists, OSError, and NoSession if the part is empty.
     """
     names = frozenset(cars)
 

@@ -1,4 +1,4 @@
-"""Requests messages that a recorder missed from the caches of their publishers. session_writer.py drops duplicates.
+"""Asks the caches of publishers for messages that a recorder missed. session_writer.py drops duplicates.
 
 A recording has holes exactly where they matter most: the moment when the network broke is the moment that somebody will
 want to look at. A subscriber alone cannot prevent that, because messages that were published while it was away are
@@ -36,12 +36,12 @@ QUERY_AFTER_START_S: Final = (1.0,)
 """Delay of the query after the start. It is for publishers that started with us and may have missed our
 subscription."""
 QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
-"""Delays of the queries after a reconnect. Others retry within half a second, and a loaded machine delays them
-further."""
+"""Delays of the queries after a reconnect. Other clients reconnect within half a second, or later on a loaded
+machine."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
 GAP_MARGIN_S: Final = 2.0
-"""Time that the network may have taken for the last message before a gap, and takes for the query: a publisher counts
-the window from when the query arrives."""
+"""Margin of a window for two delays of the network: that of the last message before the gap, and that of the query. A
+publisher counts the window back from the arrival of the query."""
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
 """Number of polls that cover Zenoh's 2 s lease. Counted in polls because a stalled process does not poll."""
 MAX_SINGLE_KEYS: Final = 16
@@ -74,7 +74,7 @@ class Backfill:
         self._thread.start()
 
     def close(self) -> None:
-        """Request messages that are still missing a last time, and end the thread."""
+        """Ask one last time for the messages that are still missing, and end the thread."""
         self._closing.set()
         self._thread.join()
 

@@ -2,7 +2,7 @@
 
 Conditions are evaluated as in `fleet find`: the same evaluator gets the same readings with their own times. Pins are on
 the recorder's clock, like its files. So a pin lies around the moment at which the reading came. A backfilled reading
-came late and is in a later file. So its pin lies around the reading's own time, and lasts until it came.
+came late and is in a later file. So its pin lies around the reading's own time, and lasts until the reading came.
 
 A STOP of all cars is one command with one id, which each gateway reports. So it is recognized when a second car reports
 it, or the only car if there are no others.

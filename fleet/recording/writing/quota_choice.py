@@ -1,7 +1,7 @@
 """Decides what the quota removes when the sessions together are too large. Pure; quota_removal.py removes the files.
 
-The unit is a segment: a file, with a quota of one minute. A segment is pinned if a pin of any session of its fleet
-touches its time, because the time before a pin may be in another session.
+The unit is a segment, which is one file: with a quota, one minute. A segment is pinned if a pin of any session of its
+fleet touches its time, because the time before a pin may be in another session.
 
 Unpinned segments are removed first, the oldest of all sessions before the others. Pinned segments may fill half of the
 quota. If they fill more, the oldest of them are removed before anything else. So even if a condition is always true,

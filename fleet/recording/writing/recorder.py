@@ -53,9 +53,10 @@ SUBSCRIBER_QUEUE_SIZE: Final = 16_384
 MAX_READ_BATCH: Final = 4_096
 """Maximum number of messages that are read from one subscription before the next one."""
 SHUTDOWN_DRAIN_S: Final = 0.3
-"""Time at shutdown for messages in transit, and then the timeout for an answer of the hub."""
+"""Wait at shutdown for messages in transit. It is also the timeout of the wait after it, for an answer of the hub."""
 MAX_DRAIN_DELAY_S: Final = 0.2
-"""Maximum delay of both together. After a longer delay, hub or recorder stood still, and both are done again."""
+"""Maximum delay of both waits together, beyond SHUTDOWN_DRAIN_S. If it is longer, the hub or the recorder stood still, and
+both waits are repeated."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
@@ -115,8 +116,8 @@ class Recorder:
         self._options = options or Options()
         self._pin_rules = pins
         self._read_people = people
-        """Returns the people in the fleet file, who may start and stop. If None, the people that the gateways know
-        may."""
+        """Returns the people in the fleet file, who may start and stop the recorder. If it is None, the people that the
+        gateways know may."""
         self._pin_watch = PinWatch(pins)
         self._max_messages = max_messages
         self._max_bytes = max_bytes

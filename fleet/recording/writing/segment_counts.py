@@ -26,7 +26,7 @@ class KeyState:
         self.channel = channel
         self.count = self.first = self.final = 0
         self.seen_ns = 0
-        """When the newest message of the key was received, also in an earlier segment. 0 if there was none."""
+        """When the newest message of the key was received, even if it is in an earlier segment. 0 if there was none."""
         self.has_events = messages.name_in(str(encoding)) == EVENTS.message
         """True for the events of commands, in which stops are counted."""
 

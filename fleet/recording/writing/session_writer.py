@@ -38,7 +38,7 @@ OVERFLOW_BATCH_BYTES: Final = 100_000
 class Sync(StrEnum):
     """When to wait for the disk.
 
-    Flushed data survives a crash of ours, and is lost only if the operating system crashes.
+    Flushed data survives a crash of the recorder. It is lost only if the operating system crashes.
     """
 
     NEVER = "never"
@@ -285,7 +285,7 @@ class SessionWriter:
         self.description.pins = [pin.to_dict() for pin in self._pins.pins]
 
     def close(self, now_ns: int) -> None:
-        """Write the buffer and end the session, also into the reserve of the disk.
+        """Write the buffer and end the session, even if this uses up the reserve of the disk.
 
         Count messages that still do not fit as dropped, and describe them in `cost`.
         """
@@ -330,7 +330,7 @@ class SessionWriter:
     # ------------------------------------------------------------------ segments
 
     def _open(self, now_ns: int, room_bytes: int) -> bool:
-        """Begin a segment, and the session before its first one. If space is short, pause and return False."""
+        """Begin a segment. Before the first one, begin the session. If space is short, pause and return False."""
         free = self.free_bytes
         if self._unflushed:  # otherwise, if the first message is large, each attempt would begin an empty file
             room_bytes += len(self._unflushed[0][2])
@@ -416,7 +416,7 @@ class SessionWriter:
     # ------------------------------------------------------------------ full disk
 
     def _on_write_error(self, error: OSError) -> None:
-        """Pause if the disk is full, with the unflushed messages as buffer. Raise any other error.
+        """If the disk is full, pause, and keep the unflushed messages in the buffer. Raise any other error.
 
         The segment stays as at its last flush. Its end is kept in memory until there is room for it.
         """
@@ -460,9 +460,9 @@ class SessionWriter:
         self._drops[key] = self._drops.get(key, 0) + 1
 
     def drop_received(self, key: str, sender: Hashable, number: int, count: int) -> None:
-        """Count messages that did not fit into the queue. `number` is that of the last.
+        """Count messages that did not fit into the queue. `number` is that of the last one.
 
-        Without numbers, `sender` is None.
+        `sender` is None if they have no numbers.
         """
         if sender is None:
             self._drops[key] = self._drops.get(key, 0) + count
