@@ -41,7 +41,7 @@ def _can_coincide(one: PlanCondition, other: PlanCondition) -> bool:
 
 
 def find_conflicts(plan: Plan) -> Iterator[tuple[Rule, str, bool]]:
-    """Yield each rule that contradicts an earlier rule or itself, with a text, and whether it always does."""
+    """Yield each rule that contradicts an earlier rule or itself, with a text, and True if it always does so."""
     for index, rule in enumerate(plan.rules):
         possible: list[str] = []
         for effect in rule.effects:
@@ -53,7 +53,8 @@ def find_conflicts(plan: Plan) -> Iterator[tuple[Rule, str, bool]]:
                     whom = effect.who if effect.who not in (THIS_CAR, OTHER_CARS, ALL_CARS) else "the same car"
                     if _always_meet(rule, effect, earlier, other):
                         words = (
-                            f"it contradicts {earlier.name}, which is true whenever it is and wants {whom} to be {what}"
+                            f"it contradicts {earlier.name}: whenever it is true, that one is, too, and wants {whom} "
+                            f"to be {what}"
                         )
                         yield rule, f"{words}. The first counts.", True
                     elif not implies(earlier.when, rule.when) and earlier.name not in possible:

@@ -235,7 +235,7 @@ class _Check:
         return ""
 
     def _out_of_phase(self, rule: Rule) -> Iterator[PlanFault]:
-        """Report a rule about a role (or one that gives a role) that counts in none of the rule's phases."""
+        """Report a rule that is about a role, or gives one, if that role counts in none of the rule's phases."""
         for role in (rule.when.role, *(effect.role for effect in rule.effects)):
             if role is not None and not self._in_some_phase(self._plan.roles[role], rule.during):
                 where = f"phase {' or '.join(sorted(rule.during))}" if rule.during is not None else "any phase"

@@ -355,7 +355,7 @@ def describe_unmeasured(expression: Expression, cars: Iterable[tuple[CarSnapshot
 # Each step of a plan calls this. The key is the platform's name, because its hash is faster than a profile's.
 @cache
 def _list_unmeasured(expression: Expression, platform: str, mode: str) -> tuple[str, ...]:
-    """List the readings because of which a car cannot measure the expression in this mode. Unknown modes give none."""
+    """List the readings in the expression that a car does not measure in this mode. Unknown modes give none."""
     profile = CarSnapshot(platform=platform).profile
     if profile is None or mode not in set(Mode) or can_be_true(expression, profile, Mode(mode)):
         return ()

@@ -98,7 +98,7 @@ class Effect:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Effects that count while `when` is true. With `until`: from the time at which `when` is true until `until` is."""
+    """Effects that count while `when` is true. With `until`, they go on counting until `until` is true."""
 
     name: str
     when: PlanCondition

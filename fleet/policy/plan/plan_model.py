@@ -83,7 +83,7 @@ class RuleEntry(Entry):
 
     name: str = Field("", max_length=60, description="name of the rule, which `fleet why` shows")
     when: Condition = Field(
-        description="the condition: an expression, which must be true for at least one car, or such as "
+        description="the condition: an expression, which must be true for at least one car, or a Condition such as "
         "`{any_car: light.left, for_s: 1}`"
     )
     until: Condition | None = Field(None, description="the condition that ends the rule; left out: `when` ends it")

@@ -86,14 +86,14 @@ SCOUT = "roles: {scout: {mode: tracking}}\n"
             + "rules:\n  - {when: {any_car: range.range_m < 0.5}, then: {who: all_cars, mode: manual}}\n"
             + "  - {when: {car: red, is: range.range_m < 0.3}, then: {who: this_car, mode: following}}",
             "rule 2",
-            "it contradicts rule 1, which is true whenever it is and wants the same car to be manual",
+            "it contradicts rule 1: whenever it is true, that one is, too, and wants the same car to be manual",
         ),
         (
             SCOUT
             + "rules:\n  - {when: {any_car: line.left_outer}, then: {who: red, led: '#090000'}}\n"
             + "  - {when: {any_car: line.left_outer}, then: {who: red, led: '#000900'}}",
             "rule 2",
-            "it contradicts rule 1, which is true whenever it is and wants red to be #090000",
+            "it contradicts rule 1: whenever it is true, that one is, too, and wants red to be #090000",
         ),
         (
             SCOUT + "rules: [{when: line.left_outer, then: [{who: red, mode: manual}, {who: red, mode: following}]}]",
