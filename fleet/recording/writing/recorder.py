@@ -55,8 +55,8 @@ MAX_READ_BATCH: Final = 4_096
 SHUTDOWN_DRAIN_S: Final = 0.3
 """Wait at shutdown for messages in transit. It is also the timeout of the wait after it, for an answer of the hub."""
 MAX_DRAIN_DELAY_S: Final = 0.2
-"""Maximum delay of both waits together, beyond SHUTDOWN_DRAIN_S. If it is longer, the hub or the recorder stood still, and
-both waits are repeated."""
+"""Maximum delay of both waits together, beyond SHUTDOWN_DRAIN_S. After a longer delay, the hub or the recorder stood
+still, and both waits are repeated."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
