@@ -50,7 +50,7 @@ class StopReport:
         if event.phase in (Phase.COMPLETE, Phase.SENT):
             self._result_ns[car] = max(messages.stamp_ns(event.stamp), self._result_ns.get(car, 0))
         is_stopped = event.phase == Phase.COMPLETE or (event.phase == Phase.SENT and event.basis)
-        # This STOP may still stop a car later that it seemed not to reach.
+        # A car that this STOP seemed not to reach may still be stopped by it later.
         if self._is_over(car) and not (is_stopped and self._cars[car]["state"] == Phase.FAILED):
             return
         match event.phase:

@@ -16,7 +16,7 @@ from schemas.words import Mode
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Reason for a role that a car had before a restart of the coordinator."""
 HUB_RETURN_GRACE_S: Final = 5.0
-"""Maximum time to wait for gateways after the hub is back. Their cars keep their roles so long. Gateways try to
+"""Maximum time to wait for gateways after the hub is back. Their cars keep their roles for this time. Gateways try to
 reconnect every 0.5 s."""
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""

@@ -30,7 +30,7 @@ from schemas.topics import Qos
 from schemas.words import Phase, Rank, Reason
 
 SECOND_CHECK_DELAY_S: Final = 0.3
-"""Delay before a supervisor looks for others. Two that start at the same moment have then both declared themselves."""
+"""Delay of the second search for other supervisors. Two that start at once have then both declared themselves."""
 SERVICE_QUERY_TIMEOUT_S: Final = 2.0
 SUBSCRIPTIONS: Final = (
     "*/state/*",
