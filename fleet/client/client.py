@@ -501,7 +501,7 @@ class Car(CarCommands[Outcome]):
 
 
 class LeasedCar(Car):
-    """A car within `with fleet.car("red").lease() as car`: commands raise unless they are carried out."""
+    """A car within `with fleet.car("red").lease() as car`: a command that is not carried out raises."""
 
     def __init__(self, fleet: Fleet, name: str, lease: "Lease[LeasedCar]") -> None:
         super().__init__(fleet, name)
