@@ -487,7 +487,7 @@ class Executor(Driver):
             opens = model.rest_is_sure or self._full_stop_runs
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))
-        if stopped and self._repeats(model.pacing.repeat_at):
+        if stopped and self._repeats(max(now, model.pacing.repeat_at)):
             times.append(max(model.pacing.repeat_at, model.mode_left_by))
         if self._renews and queue.mode_change is None:
             times.append(max(self.stops.renewal.due_at, model.ready_at))
