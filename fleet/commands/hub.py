@@ -35,6 +35,8 @@ from schemas.words import Rank
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
 MAX_JOIN_LINE: Final = 500
 """Maximum characters of the line that `fleet join -` reads."""
+TRY_INTERVAL_S: Final = 0.1
+"""Interval at which a hub that may be restarting is tried again."""
 HUB_RESTART_S: Final = 2.0
 """Time within which gateways are connected again after new rules. The hub looks for new rules every 0.5 s, and gateways
 try to connect every 0.5 s."""
@@ -322,46 +324,46 @@ def _address(written: str, default: int) -> tuple[str, int]:
 
 def _describe_cars_on(endpoint: str, within_s: float) -> str:
     """Return a sentence about the cars that are on. Retry for `within_s`, because the hub may be restarting."""
-    deadline = time.monotonic() + within_s
-    while True:
-        is_last = time.monotonic() > deadline
+    for is_last in _tries(within_s):
         try:
             with Bus.open(endpoint) as bus:
                 cars = sorted(key.rpartition("/")[2] for key in bus.tokens(keys.car_token("*", "*")))
         except BusError:
             if is_last:
                 return "Its hub does not answer yet; `fleet list` shows the cars once it does."
-            cars = []
-        if cars or is_last:
-            return f"Cars: {', '.join(cars) or 'none is on'}."
-        time.sleep(0.1)
+            continue
+        if cars:
+            return f"Cars: {', '.join(cars)}."
+    return "Cars: none is on."
 
 
 def _stop_first(endpoint: str, car: str) -> None:
     """Stop a car whose gateway is about to lose its certificate: nobody reaches it over the bus after that.
 
-    The hub may be restarting just now, because its own certificate or its rules have changed. So try for a while.
+    Try for a while, because the hub may be restarting: its own certificate or its rules may just have changed.
     """
-    deadline = time.monotonic() + HUB_RESTART_S
-    while not _try_to_stop(endpoint, car, is_last=time.monotonic() > deadline):
-        time.sleep(0.1)
+    for is_last in _tries(HUB_RESTART_S):
+        try:
+            with Fleet(endpoint, kind=Rank.PERSON) as client:
+                outcome = client.car(car).stop() if car in client.cars() else None
+        except BusError as error:
+            if is_last:
+                click.echo(f"{car} was not stopped: {error}", err=True)
+            continue
+        if outcome is not None and outcome.ok:
+            click.echo(f"{car} was stopped first, because its gateway loses the bus now.", err=True)
+            return
+        if outcome is not None and is_last:
+            click.echo(f"NOT STOPPED: {car}: {outcome.words} Its gateway loses the bus now: go to the car.", err=True)
 
 
-def _try_to_stop(endpoint: str, car: str, *, is_last: bool) -> bool:
-    """Try to stop a car that is on, and say how that went. Return False, and say nothing, if another try is due."""
-    try:
-        with Fleet(endpoint, kind=Rank.PERSON) as client:
-            outcome = client.car(car).stop() if car in client.cars() else None
-    except BusError as error:
-        if is_last:
-            click.echo(f"{car} was not stopped: {error}", err=True)
-        return is_last
-    if outcome is not None and outcome.ok:
-        click.echo(f"{car} was stopped first, because its gateway loses the bus now.", err=True)
-        return True
-    if outcome is not None and is_last:
-        click.echo(f"NOT STOPPED: {car}: {outcome.words} Its gateway loses the bus now: go to the car.", err=True)
-    return is_last
+def _tries(within_s: float) -> Iterator[bool]:
+    """Yield for each try within this time whether it is the last one."""
+    deadline = time.monotonic() + within_s
+    while not (is_last := time.monotonic() > deadline):
+        yield is_last
+        time.sleep(TRY_INTERVAL_S)
+    yield is_last
 
 
 def _own_store(endpoint: str) -> HubStore:
