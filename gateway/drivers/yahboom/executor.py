@@ -460,8 +460,7 @@ class Executor(Driver):
         if running is not None:
             waits = self._has_new_command(now) and self.accepts_commands(now)
             times.extend(self.stops.timeouts(running) if waits else self.stops.deadlines(running, now))
-            acts = waits and bool(self.queue.one_shots) and not self._actions_wait(now)
-            if acts and self._has_stream_since(running.began_at):
+            if waits and now < running.goes_first_at and self._has_stream_since(running.began_at):
                 times.append(running.goes_first_at)
         times.extend(self._command_times(now))
         return max(now, min(times, default=float("inf")))
