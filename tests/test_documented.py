@@ -15,7 +15,7 @@ from fleet.cli import cli
 from fleet.client.diagnosis import CHECKS
 from schemas.commands import COMMANDS
 from schemas.words import Mode, Reason
-from tests.support.sources import PRODUCT, ROOT, nodes, source_files, text
+from tests.support.sources import GROUP, PRODUCT, ROOT, nodes, source_files, text
 from tests.tools.pages import files, proto
 from tests.tools.pages.command_line import commands, gateway_parsers, options, shown_action, subcommands
 
@@ -169,6 +169,7 @@ def log_codes() -> Iterator[str]:
                 yield ast.unparse(node.args[1])[2:-1].partition("{")[0]
 
 
+@pytest.mark.xdist_group(GROUP)
 def test_each_event_is_documented() -> None:
     documented = rows("docs/reference/events.md", "Codes of a gateway")
     logged = set(log_codes())
@@ -190,6 +191,7 @@ def environment_variables() -> Iterator[str]:
                 yield node.value
 
 
+@pytest.mark.xdist_group(GROUP)
 def test_each_environment_variable_is_documented() -> None:
     found = set(environment_variables())
     assert {"FLEET_ENDPOINT", "FLEET_STATE_DIR"} <= found

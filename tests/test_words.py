@@ -9,9 +9,9 @@ from typing import Final
 import pytest
 
 from schemas import commands, words
-from tests.support.sources import ROOT, nodes, source_files
+from tests.support.sources import GROUP, ROOT, nodes, source_files
 
-pytestmark = pytest.mark.xdist_group("sources")
+pytestmark = pytest.mark.xdist_group(GROUP)
 
 FIELDS: Final[Mapping[str, tuple[EnumType, ...]]] = {
     "asked": (words.Mode,),
