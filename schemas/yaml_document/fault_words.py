@@ -20,8 +20,7 @@ Where = tuple[str | int, ...]
 _MAX_VALUE_LENGTH: Final = 60
 _MAX_WORDS_LISTED: Final = 12
 _ITEMS: Final = {"boxes": "box", "capabilities": "capability", "line": "point", "path": "point", "then": "effect"}
-"""What an item of a list is called, by the name of the list. In other lists, it is the name of the list without its
-s."""
+"""The name of an item, by the name of its list. An item of any other list has the name of the list without its s."""
 _TYPES: Final = {
     "string": "text",
     "integer": "a whole number",

@@ -64,7 +64,7 @@ class StopCase:
     words: str = ""
     """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
     rule: Callable[["StopCase", StopFacts], "StopCase | None"] = _never
-    """What `ends` calls. The first argument is this case."""
+    """The function that `ends` calls. Its first argument is this case."""
     probes: Callable[[StopFacts], bool] = _no
     """Returns True if the car could react to a `MODE00` now, and show it."""
     repeats_lost: bool = True
