@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
-from gateway.bus.identity_budgets import IdentityBudgets
+from gateway.bus.sender_budgets import SenderBudgets
 from schemas import bus, keys
 from schemas.commands import STOPS, Verb
 
@@ -81,7 +81,7 @@ class CarService:
         self._commands: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_QUERIES)
         self._large: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_OVERSIZED)
         self._stream: bus.Handover[Request] = bus.Handover(limit=MAX_QUEUED_DRIVES, newest=True)
-        self._budgets = IdentityBudgets()
+        self._budgets = SenderBudgets()
         self.values: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_VALUE_QUERIES)
         """Queries of the latest values, each with its family."""
         self.histories: bus.Backlog[tuple[str, zenoh.Query]] = bus.Backlog(MAX_QUEUED_HISTORY_QUERIES)
@@ -166,9 +166,9 @@ class CarService:
             return self._commands(request, reserve=MAX_QUEUED_STOPS)
         return (self._large if unread else self._commands)(request)
 
-    def _admits(self, key: str) -> bool:
+    def _admits(self, key: str, session: str) -> bool:
         """Return True if a drive of a stream is within the budget of its sender. Runs on a Zenoh thread."""
-        return self._budgets.take(key, time.monotonic())
+        return self._budgets.take(key, session, time.monotonic())
 
     def _on_sample(self, sample: bus.Sample) -> None:
         """Queue a drive of a stream. Runs on a Zenoh thread."""

@@ -71,6 +71,12 @@ def sequence_of(info: zenoh.SourceInfo) -> int:
     return (int(info.source_sn) + 1) & 0xFFFFFFFF
 
 
+def session_of(sample: zenoh.Sample) -> str:
+    """Return the id of the Zenoh session that published a sample. Return an empty text if the sample does not say."""
+    info = sample.source_info
+    return "" if info is None else str(info.source_id.zid)
+
+
 def sample_of(sample: zenoh.Sample, largest: int | None = None) -> Sample:
     """Convert a Zenoh sample. `largest` is the maximum size of the payload in bytes."""
     stamp = sample.timestamp

@@ -27,7 +27,7 @@ from schemas.bus.errors import BusError, HubUnreachable, NoFleet
 from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
-from schemas.bus.sample import Failure, Sample, sample_of, unread
+from schemas.bus.sample import Failure, Sample, sample_of, session_of, unread
 from schemas.keys import renewal_key
 from schemas.process import signals
 from schemas.topics import Qos, Topic
@@ -308,18 +308,19 @@ class Bus:
         callback: Callable[[Sample], object],
         *,
         largest: int | None = None,
-        admits: Callable[[str], bool] | None = None,
+        admits: Callable[[str, str], bool] | None = None,
     ) -> Declared:
         """Subscribe. The callback runs on a Zenoh thread, so it must hand the sample over and return.
 
         `largest` is the maximum size of a payload in bytes (see `Sample.unread`). `admits` is called with the key of
-        each message before anything else of it is read. If it returns False, the message is dropped.
+        each message and the session that published it, before anything else is read (see `session_of`). If it returns
+        False, the message is dropped.
         """
         declaration = next(self._next_declaration)
 
         def declare(session: zenoh.Session, number: int) -> Any:
             def on_sample(sample: zenoh.Sample) -> None:
-                if admits is not None and not admits(str(sample.key_expr)):
+                if admits is not None and not admits(str(sample.key_expr), session_of(sample)):
                     return
                 if not self._is_twin(number, lambda: mark_of_sample(declaration, sample)):
                     callback(sample_of(sample, largest))

@@ -1,11 +1,13 @@
 """An operator that publishes drives. Arguments: kind, publications a second, seconds. It prints their number."""
 
 import json
+import os
 import sys
 import time
 
 from schemas import bus, keys, messages
 
+os.nice(10)  # operators have computers of their own, and take no time from the gateway's
 kind, rate, seconds = sys.argv[1], float(sys.argv[2]), float(sys.argv[3])
 drives = [
     json.dumps({"motion": motion, "duration_s": 0.5, "sender": f"flood-{kind}", "kind": kind}).encode()
