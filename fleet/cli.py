@@ -152,7 +152,7 @@ _EXTRAS: Final = {
 class _BashCompletion(BashComplete):
     """Completion for bash.
 
-    Without the second line, bash treats `@` as a separate word, so it cannot complete the name of a group.
+    The second line of the template makes `@` a part of words, so that bash can complete the name of a group.
     """
 
     source_template = f"{BashComplete.source_template}\nCOMP_WORDBREAKS=${{COMP_WORDBREAKS//@/}}\n"
@@ -162,7 +162,8 @@ class _BashCompletion(BashComplete):
 class _FishCompletion(FishComplete):
     """Completion for fish.
 
-    It works for lists such as `red,blue`, because only the first comma ends the type of a completion.
+    A line of completions has a type, a comma and the word. Split it only at this comma, because the word may be a list
+    such as `red,blue`.
     """
 
     source_template = FishComplete.source_template.replace('string split ","', 'string split -m 1 ","')
@@ -283,7 +284,7 @@ def _command_path(error: click.UsageError) -> str:
 def _one_line(error: click.ClickException) -> str:
     """Return the message on one line.
 
-    Messages of our own types quote the wrong word, so the name of an argument is left out.
+    The messages of our own types already quote the wrong word, so leave out the name of an argument.
     """
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         option = f"{error.param.opts[-1]}: " if isinstance(error.param, click.Option) else ""

@@ -41,11 +41,11 @@ fixed:
   green: {mode: obstacle_avoidance}
 """
 LED_COLORS: Final = {"red": (255, 0, 16), "green": (0, 255, 64), "blue": (0, 64, 255)}
-# On a busy machine, a process takes 10 s to start, and a message a second.
+# On a busy machine, a process takes 10 s to start, and a message takes 1 s to arrive.
 CHECK_TIMEOUT_S: Final = 30.0
 """Timeout for a condition of a check."""
 PROCESS_EXIT_TIMEOUT_S: Final = 30.0
-"""Timeout for the exit of a process: twice the time of the longest stop sequence in the worst case."""
+"""Timeout for the exit of a process: twice the worst case of the longest stop sequence."""
 
 
 @dataclass(frozen=True, slots=True)

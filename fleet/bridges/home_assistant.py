@@ -11,9 +11,9 @@ Availability is retained, because Home Assistant reads it when it starts. It is 
 gone or is silent, or whose link is lost. The bridge has an availability of its own, which its last will sets to
 `offline`. An entity is available only if the car and the bridge are.
 
-**After a crash,** the announcements and the `online` of cars from a bridge that was killed stay in the broker. The next
-bridge reads them when it begins (`adopt`), and publishes `offline` for cars that are not there. A bridge that ends
-normally removes them all, so Home Assistant forgets the devices.
+**After a crash,** the broker still has what the bridge had retained: the announcements, and `online` for its cars. The
+next bridge reads these messages when it begins (`adopt`), and publishes `offline` for cars that are not there. A bridge
+that ends normally removes them all, so Home Assistant forgets the devices.
 """
 
 import json
@@ -118,7 +118,7 @@ def _words(*words: str) -> dict[str, Any]:
 
 
 def _flag(device_class: str | None = None) -> dict[str, Any]:
-    # The texts are those in which a template prints True and False.
+    # A template prints True and False as these texts.
     config = {"platform": "binary_sensor", "payload_on": "True", "payload_off": "False"}
     return {**config, "device_class": device_class} if device_class else config
 

@@ -165,8 +165,8 @@ class MqttBridge:
                 each.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         # If there are unread bytes when we close the connection, it is reset, which looks like a crash to the broker.
-        # So unsubscribe first. A broker that hangs does not answer. Later it will read all of this, or publish our last
-        # will.
+        # So unsubscribe first. A broker that hangs does not answer. Later it will read these messages, or publish our
+        # last will.
         qos = 1
         try:
             await client.unsubscribe([self._plan.availabilities, self._plan.birth], timeout=_FAREWELL_TIMEOUT_S)

@@ -17,9 +17,9 @@ MAX_EXPORTED_CARS: Final = 256
 """Maximum number of cars with metrics, the first by name. Each car has about eighty series, and anybody on an open bus
 may invent cars. The fleet file of a whole hall has some dozens."""
 MAX_RECENT_RECORDS: Final = 4096
-"""Maximum number of remembered records of commands. They are remembered so that each phase counts once, because a
-command whose car cannot show its effect ends with a second `sent`, at most 18 s later
-(schemas.limits.MAX_EVIDENCE_TIMEOUT_S). This is enough for 200 records a second."""
+"""Maximum number of remembered records of commands. They are remembered so that each phase counts once: if a car cannot
+show the effect of a command, the command ends with a second `sent`, at most 18 s later
+(schemas.limits.MAX_EVIDENCE_TIMEOUT_S). The number is enough for 200 records a second."""
 _REFUSALS: Final = frozenset({Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 Sampled = tuple[Metric, tuple[str, ...], float]
@@ -41,7 +41,7 @@ class FleetMetrics:
     def on_sample(self, sample: Sample, now: float, wall_s: float | None = None) -> None:
         """Handle a message.
 
-        `wall_s` is the wall clock if a query returned the message, because then it may be old, else None.
+        `wall_s` is the wall clock if a query returned the message, which may then be old. Otherwise it is None.
         """
         key = keys.parse(sample.key)
         if key is None:

@@ -3,8 +3,8 @@
 `python -m fleet.replay.foxglove_layout [CAR ...] > LAYOUT.json` writes it.
 
 `deploy/foxglove.json` is the layout for the cars of `make demo`. Foxglove draws only fields of messages, so the layout
-leaves out everything that lenses.py or drawings.py derives. Where Rerun shows lines of text that we compose, it shows
-the raw messages.
+leaves out everything that lenses.py or drawings.py derives. Where Rerun shows lines of text that we compose, Foxglove
+shows the raw messages.
 """
 
 import json
@@ -42,7 +42,7 @@ class _FoxgloveLayout:
         return panel
 
     def key(self, car: str, topic: str) -> str:
-        """Return the key of a car's topic, or of a service's: such a topic begins with `@` and the service's name."""
+        """Return the key of a topic of a car or a service. The topic of a service begins with `@` and its name."""
         return f"{self._fleet}/{topic}" if topic.startswith("@") else keys.topic_key(self._fleet, car, topic)
 
     def path(self, car: str, part: Curve | StateTrack) -> str:

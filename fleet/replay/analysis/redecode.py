@@ -2,8 +2,8 @@
 
 The readings of a frame depend on the platform and the mode of the car. Both come from the recording. But a recording
 leaves two things open: which of two modes or platforms applied at the moment of a frame, and whether silence or the
-next frame ended a frame that has no # at its end. Such a frame may have several possible results. Then it counts as
-undecided, and it is a difference only if none of them is the recorded one.
+next frame ended a frame that has no # at its end. So a frame may have several possible results. It then counts as
+undecided, and it is a difference only if none of the results is the recorded one.
 """
 
 from collections import deque
@@ -110,7 +110,7 @@ class Redecoding:
             self.counts.undecided += 1
         found = [list(_differences(self.car, frame, outcome)) for outcome in outcomes]
         if all(found):
-            # Show the nearest of several possible results.
+            # Of several possible results, show the one with the fewest differences.
             yield from min(found, key=len)
 
     def _outcomes(self, frame: Rx) -> list[Outcome]:

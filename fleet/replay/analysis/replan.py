@@ -38,8 +38,8 @@ STEP_INTERVAL_NS: Final = 100_000_000
 MAX_BATCH_NS: Final = 10_000_000
 """Maximum time between messages that one step processes together."""
 COORDINATOR_HISTORY_NS: Final = 60_000_000_000
-"""A coordinator starts with queries for the latest readings. Here the readings of this time before its start replace
-their answers."""
+"""A coordinator starts with queries for the latest readings. Here the answers are the readings that were recorded
+within this time before its start."""
 _FINAL_PHASES: Final = frozenset(Phase) - {Phase.ASKED, Phase.QUEUED}
 _SUCCESS_PHASES: Final = frozenset({Phase.SENT, Phase.COMPLETE, Phase.EFFECT_SEEN})
 
@@ -51,7 +51,7 @@ class _NewPlan:
 
 
 def keys_for(fleet: str, plans: Iterable[Plan]) -> list[str]:
-    """Return the key expressions that a coordinator with these plans subscribes to, and that of command outcomes."""
+    """Return the key expressions that a coordinator with these plans subscribes to, and the one of command outcomes."""
     topics = {topic_of(name) for plan in plans for name in plan.read_names}
     return [f"{fleet}/*/{topic}" for topic in ("state/*", "event/command", *sorted(topics)) if topic]
 
@@ -157,8 +157,8 @@ class Replanning:
         known = {car: role for car, role in self.run.roles.items() if role in self._plan.roles}
         snapshot = self._observer.snapshot(())
         if not self.run.whole or any(not snapshot.cars.get(car, UNKNOWN_CAR).mode for car in known):
-            # The coordinator started before the recording, or already knew its cars then. So its first roles are those
-            # of that time.
+            # The coordinator started before the recording, or knew more of its cars than the recording has. So let it
+            # begin with its first recorded roles.
             return restore(
                 self._plan,
                 snapshot,

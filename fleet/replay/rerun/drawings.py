@@ -44,13 +44,14 @@ MAX_NS: Final = 2**63
 """Times in Rerun are smaller than this."""
 _Times = dict[str, Any]
 _MAX_LEDS: Final = 256
-"""Maximum number of LED colors that tracks show in their own color, and of LED commands that await their outcome."""
+"""Maximum number of LED colors that tracks can show, and of LED commands that await their outcome."""
 
 
 class Drawing:
-    """Derived chunks and contents of a session. `limit` is the maximum number of points per path. None means no limit.
+    """Derives chunks from those of a session, and collects what the session contains.
 
-    `car_colors` are the colors of the cars in the fleet file.
+    `limit` is the maximum number of points per path. None means no limit. `car_colors` are the colors of the cars in
+    the fleet file.
     """
 
     def __init__(self, limit: int | None = None, car_colors: Mapping[str, Rgb] | None = None) -> None:
@@ -163,7 +164,7 @@ class Drawing:
     def ground(self, topic: str) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Return the lowest and highest x and y of the paths of a topic in meters, or None if it has none.
 
-        For the truth they include the walls. A measured pose has another origin, so there the walls would mislead.
+        For the truth, the walls count, too. Measured poses have another origin, so there the walls would mislead.
         """
         of_topic = [key for key in self._parts if panels.topic_of(key) == topic]
         paths = [points for key in of_topic if (points := self._car_path(key)) is not None]

@@ -38,7 +38,7 @@ MAX_WAITING_MESSAGES: Final = 50_000
 MAX_PATH_POINTS: Final = 3_000
 """Maximum number of points of the path of each simulated car: five minutes."""
 DEFAULT_VIEW_S: Final = 120.0
-"""Time span in view. The view can also show all."""
+"""Time span that the view shows by default. It can also show all."""
 VIEWER_FLUSH_TIMEOUT_S: Final = 2.0
 COORDINATOR_TIMEOUT_S: Final = 3.0
 """Timeout for the coordinator's answer. If there is no coordinator, nobody waits."""
@@ -166,7 +166,7 @@ class Live:
 
 
 def _write(path: Path, batch: list[Sample], left_out: LeftOut) -> None:
-    """Write those messages of a batch that Rerun can show to an MCAP file, and count the rest."""
+    """Write to an MCAP file the messages of a batch that Rerun can show, and count the rest."""
     now = time.time_ns()
     schemas: dict[str, int] = {}
     channels: dict[str, tuple[str, int]] = {}

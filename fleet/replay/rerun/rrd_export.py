@@ -81,7 +81,7 @@ class Part:
 
     @property
     def words(self) -> str:
-        """Return the end of the messages of NoSession, which say that there is nothing to show."""
+        """Return what a message of NoSession says about this part."""
         return "" if self == WHOLE_SESSION else " of these cars in this time"
 
 
@@ -162,7 +162,7 @@ def _write(
     *,
     final: bool = False,
 ) -> Replayed | None:
-    """Write an .rrd. Return None if Rerun did not read every message, unless it is the `final` attempt."""
+    """Write an .rrd. Return None if Rerun did not read every message, unless this is the `final` attempt."""
     drawing = Drawing(car_colors=read_colors(session.path / FLEET_FILE))
     tally = _Tally()
     stream = rrc.LazyChunkStream.merge(*(reader.stream() for reader in readers))
@@ -210,7 +210,7 @@ def _write(
 
 
 def _name_missed(session: Session, part: Part, missed: Counter[str], left_out: LeftOut) -> None:
-    """Add the messages that Rerun did not read to `left_out`. It skips messages that do not match their schema."""
+    """Add to `left_out` the messages that Rerun did not read. Rerun skips messages that do not match their schema."""
     bad = unreadable(session, part.selection, missed.__contains__) if missed else Counter[str]()
     for key, count in missed.items():
         known = min(count, bad[key])
