@@ -21,7 +21,11 @@ class Debounced:
 
 
 def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the value itself
-    """Follow a condition: on after `for_s` of true, None after HYSTERESIS_S of false or UNKNOWN_TIMEOUT_S unknown."""
+    """Return the new state of a condition.
+
+    It is on after it has been true for `for_s`. Then it ends (None) after it has been false for HYSTERESIS_S, or
+    unknown for UNKNOWN_TIMEOUT_S.
+    """
     if before is None or not before.on:
         if not value:
             return None

@@ -362,7 +362,7 @@ def _overrides(
                     decided.add(car)
                     result[car] = Override(rule, state, effect)
         elif effect.role is not None:
-            # The first rule in force counts for a car, also if it gives a role: later rules cannot give it a mode.
+            # Only the first rule in force counts for a car. If that rule gives a role, no later rule gives a mode.
             decided |= {car for car in targets(effect, state, subjects, roles) if pinned[car].rule == rule.name}
     return result
 

@@ -10,7 +10,10 @@ LEFT_ALONE: Final = "left alone"
 
 
 class DecisionKind(StrEnum):
-    """Kind of a decision. For a car: what decided. For a role: how it stands. PHASE is for the phase."""
+    """The kind of a decision.
+
+    For a car, it says what decided. For a role, it says whether the role has its cars. PHASE is for the phase.
+    """
 
     ROLE = "role"
     RULE = "rule"
@@ -45,7 +48,7 @@ class Decision:
     """Time at which the cause became the current one, s on the step's clock."""
 
     def after(self, before: "Decision | None", now: float) -> "Decision":
-        """Return `before`, the last step's decision, if this one says the same (its readings stay), else this one."""
+        """Return `before`, the last step's decision, if this one says the same in the same words, else this one."""
         if before is None or before.cause != self.cause:
             return replace(self, since=now)
         if (before.decided, before.why, before.would_change) == (self.decided, self.why, self.would_change):

@@ -107,7 +107,7 @@ def explain_rule(car: str, override: Override, role: str | None) -> Decision:
     changes.append("a person stops or drives it")
     why = f"{rule.name}: {rule.when.text}"
     if override.state.trigger is not None and override.state.trigger != rule.when.car:
-        why += f" (it is so of {override.state.trigger})"
+        why += f" (true for {override.state.trigger})"
     cause = f"{rule.name} {mode}"
     return _about_car(car, DecisionKind.RULE, cause, why, override.state.used, changes, role, mode)
 

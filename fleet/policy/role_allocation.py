@@ -174,7 +174,7 @@ def follow_needs(
 
 
 def allocate(candidates: Candidates) -> RoleAllocation:
-    """Give the roles in force to cars. For each car that a role lacks, its fallback gets an additional place."""
+    """Give the roles in force to cars. For each car that a role lacks, the role's fallback gets one more place."""
     plan, cars = candidates.plan, (*candidates.free, *candidates.reserved)
     counts = {
         name: _count_places(candidates, plan.roles[name], len(cars))

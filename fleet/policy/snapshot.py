@@ -35,7 +35,7 @@ class _Field:
     function: ConditionFunction | None = None
 
     def value(self, seen: Observation) -> Any:
-        """Return its value. None if it was not measured."""
+        """Return the value of the field or function. None if it was not measured."""
         if self.function is not None:
             readings = ((each.at, self._measured(each)) for each in (*seen.earlier, seen))
             return self.function.evaluate([(at, value) for at, value in readings if value is not None])
@@ -114,9 +114,9 @@ class CarSnapshot:
     """The coordinator's knowledge of one car."""
 
     present: bool = False
-    """True if its gateway is on the bus."""
+    """True if the car's gateway is on the bus."""
     mode: str = ""
-    """The last mode that it was commanded into, as its gateway reports. Empty if there is no report yet."""
+    """The last mode that the car was commanded into, as its gateway reports. Empty if there is no report yet."""
     verdict: str = ""
     evidence: str = ""
     motors: str = ""
@@ -124,9 +124,9 @@ class CarSnapshot:
     """True if the car has shown its stops before, but not the last one. Always False for a car that cannot show
     stops."""
     link: str = ""
-    """The state of its link, as its gateway reports. Empty if there is no report yet."""
+    """The state of the car's link, as its gateway reports. Empty if there is no report yet."""
     platform: str = ""
-    """From its gateway or the fleet file. Empty if it is not known."""
+    """The platform, from the car's gateway or the fleet file. Empty if it is not known."""
     capabilities: frozenset[str] = frozenset()
     estopped_by: str | None = None
     paused_by: str | None = None
@@ -136,12 +136,12 @@ class CarSnapshot:
     driven_by: str | None = None
     """The holder of a motion or a lease; never a coordinator."""
     roles: frozenset[str] | None = None
-    """The roles that the fleet file lets it have, or None if it may have any role."""
+    """The roles that the fleet file lets the car have, or None if it may have any role."""
     listed: bool = False
-    """True if the fleet file lists it."""
+    """True if the fleet file lists the car."""
     refused: Refusal | None = None
     busy: bool = False
-    """True if a command to it has no outcome yet."""
+    """True if a command to the car has no outcome yet."""
 
     @property
     def taken_by(self) -> str | None:
@@ -150,11 +150,11 @@ class CarSnapshot:
 
     @property
     def profile(self) -> CarProfile | None:
-        """The profile of its platform, or None if that is not known."""
+        """The profile of the car's platform, or None if the platform is not known."""
         return _profile(self.platform)
 
     def lacks(self, mode: str) -> bool:
-        """Return True if its platform does not know this mode, or the fleet file forbids it."""
+        """Return True if the car's platform does not know this mode, or the fleet file forbids it."""
         profile = self.profile
         return (profile is not None and mode not in profile.modes) or (self.listed and mode not in self.capabilities)
 

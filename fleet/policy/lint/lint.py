@@ -269,7 +269,7 @@ class _Check:
         if not any(mode in profile.modes for profile in profiles):
             return f"a {profiles[0].name} car, which does not know mode {mode}"
         known = self._reach.cars[car]
-        return f"not let do mode {mode} by the fleet file" if known.lacks(mode) else ""
+        return f"not allowed in mode {mode} by the fleet file" if known.lacks(mode) else ""
 
     def _conflicts(self) -> Iterator[PlanFault]:
         for rule, words, always in find_conflicts(self._plan):

@@ -119,9 +119,9 @@ class ModeReachability:
         return f"it needs {role.needs}, and never measures {_first_missing(role.needs, self.profiles(car), Mode)}"
 
     def explain_blindness(self, role: Role) -> str:
-        """Return why no car can meet the needs of this role before it has the role: it does not measure them.
+        """Return why no car can get this role: without the role, no car measures what the role needs.
 
-        The text is empty if some car can.
+        The text is empty if some car measures it.
         """
         needs = role.needs
         if needs is None:
@@ -186,7 +186,7 @@ class ModeReachability:
         ]
         words = f"It waits for {missing} from {whom}"
         if not measuring_modes:
-            return f"{words}, which no mode measures there."
+            return f"{words}, which is measured in no mode."
         they = "it is" if condition.car else "they are"
         only_in = _join_or(measuring_modes)
         return f"{words}, but {they} always in {_join_or(modes)}{where}. A car measures it only in {only_in}."
@@ -212,7 +212,8 @@ class ModeReachability:
     def _find_modes(self, car: str, phase: str, condition: PlanCondition) -> dict[Mode, str]:
         """Return the modes that the plan can bring a watched car into.
 
-        If it does so in only one case, the mode has a text about this case. Otherwise its text is empty.
+        If the plan brings the car into a mode in only one case, the mode has a text about this case. Otherwise its text
+        is empty.
         """
         roles, role = self._list_roles(car, phase), condition.role
         result = {each.mode: "" for each in roles if role in (None, each.name)}

@@ -98,7 +98,7 @@ class Effect:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Effects that count while `when` is true. With `until`, they go on counting until `until` is true."""
+    """Effects that are in force while `when` is true. With `until`, they stay in force until `until` is true."""
 
     name: str
     when: PlanCondition
@@ -137,7 +137,7 @@ class Plan:
 
     @property
     def version(self) -> str:
-        """The start of the text's hash."""
+        """The first digits of a hash of the plan's text."""
         return version_of(self.text)
 
     @property
@@ -172,7 +172,7 @@ class Plan:
 
     @property
     def read_names(self) -> frozenset[str]:
-        """The names (snapshot.NAMES) of the values that its expressions read."""
+        """The names (snapshot.NAMES) of the values that the plan's expressions read."""
         needs = [role.needs for role in self.roles.values() if role.needs is not None]
         used = [*needs, *(condition.expression for condition in self.conditions)]
         return frozenset(name for expression in used for name in expression.names)

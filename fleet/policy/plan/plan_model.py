@@ -58,7 +58,7 @@ class BlinkEntry(Entry):
     """A blinking LED."""
 
     color: _Color = Field(description='the color while the LED is on: red, or "#ff0000" in quotes')
-    blink_s: float = Field(0.5, ge=0.5, le=60, description="time for which the LED is on, and then off for as long, s")
+    blink_s: float = Field(0.5, ge=0.5, le=60, description="how long the LED is on, and how long it is off then, s")
 
 
 class EffectEntry(Entry):
@@ -75,11 +75,11 @@ class EffectEntry(Entry):
         None,
         description='color of their color LEDs, set once: red, or "#ff0000"; or {color: red, blink_s: 0.5}, to blink',
     )
-    phase: _Name | None = Field(None, description="the phase that begins; it stands alone in an effect")
+    phase: _Name | None = Field(None, description="the phase that begins; its effect has no other field")
 
 
 class RuleEntry(Entry):
-    """A rule: its effects (`then`) are in force while `when` is true. With `until`, they stay until that is true."""
+    """A rule: its effects (`then`) are in force while `when` is true. With `until`, they stay until `until` is true."""
 
     name: str = Field("", max_length=60, description="name of the rule, which `fleet why` shows")
     when: Condition = Field(
@@ -90,7 +90,7 @@ class RuleEntry(Entry):
     then: EffectEntry | list[EffectEntry] = Field(
         description="the effect: `{who: this_car, role: rest}`, or a list of effects"
     )
-    during: list[_Name] | None = Field(None, description="the phases in which the rule is looked at; left out: all")
+    during: list[_Name] | None = Field(None, description="the phases in which the rule counts; left out: all")
 
 
 class FixedEntry(Entry):
@@ -115,7 +115,7 @@ class RoleEntry(Entry):
     capabilities: list[str] = Field(default=[], description="what a car must be able to do, such as arm")
     platforms: list[str] | None = Field(None, min_length=1, description="the only platforms that may have this role")
     if_none: _Name | None = Field(
-        None, description="another role: for each car that is missing in this role, that role gets one car more"
+        None, description="the fallback: another role, which gets one more car for each car that this role lacks"
     )
     given_by: GivenBy = Field(GivenBy.PLAN, description="plan: the best car gets the role; rules: only a rule gives it")
 
