@@ -30,7 +30,7 @@ class AdapterCheck:
     cars: tuple[str, ...]
     connections: int
     notifications_per_s: int
-    """Maximum number of notifications that its cars send together."""
+    """Maximum number of notifications per second that its cars send together."""
     is_crowded: bool
     """True if some adapters can hold fewer connections, or carry fewer notifications."""
     words: str

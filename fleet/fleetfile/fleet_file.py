@@ -45,7 +45,7 @@ class Limits:
     """The limits of a car.
 
     longest_drive_s: maximum `duration_s` of a drive, up to 3600. speed_max: 0 to 1 of its top speed. battery_*_v:
-    voltage at rest below which the level is low, critical.
+    voltage at rest below which the level is low or critical.
     """
 
     longest_drive_s: float = DEFAULT_MAX_DRIVE_S
@@ -62,7 +62,7 @@ class FleetCar:
 
     link, platform: values for `gateway run --link` and `--platform`. color: #rrggbb. capabilities: words for modes and
     parts. A car of platform `auto` has the capabilities of all platforms until its gateway detects the platform. roles:
-    the roles that it may have. None means any.
+    the roles that the car may have. None means any.
     """
 
     name: str
@@ -146,7 +146,7 @@ def read_colors(path: Path) -> Mapping[str, Rgb]:
 
 
 def people_table(people: Mapping[str, FleetPerson] | None) -> People:
-    """Return the people in a fleet file as the rules know them. Gateways check which cars a person may drive."""
+    """Return the people in a fleet file as `schemas.rights` knows them. Gateways check who may drive which car."""
     if people is None:
         return NO_PEOPLE
     leads = {name for name, person in people.items() if person.rank is PersonRank.LEAD}
@@ -236,7 +236,7 @@ def _is_without(word: str, car: Mapping[str, Any]) -> bool:
 
 
 def default_color(name: str, index: int) -> str:
-    """Return the color of a car without one, as #rrggbb."""
+    """Return the color, as #rrggbb, of a car for which the file names none."""
     return hex_color(car_color(name, index))
 
 
@@ -331,7 +331,7 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
             for _, layer in layers
         )
         at = next(where for (where, _), there in zip(layers, given_limits, strict=True) if there)
-        yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}: it is at most that"
+        yield (*at, "limits"), f"battery_critical_v {critical:g} is above battery_low_v {low:g}. Lower it."
     platform, given = normalize_name(str(merged.get("platform", AUTO))), merged.get("without")
     if car.get("link") == LINK_SIM and platform.partition("+")[0] in (AUTO, Platform.UNKNOWN):
         kinds = ", ".join(kind for kind in drivers.built_in_platforms() if kind != Platform.UNKNOWN)
@@ -346,7 +346,7 @@ def _find_car_contradictions(tree: Mapping[str, Any], name: str, car: Mapping[st
         return  # reported as a fault of the platform
     if missing := [word for word in given if isinstance(word, str) and word in CAPABILITIES and word not in had]:
         at = next(where for where, layer in layers if {"platform", "without"} & _as_mapping(layer).keys())
-        words = f"no {platform} car has {', '.join(missing)}, so it is without it anyway"
+        words = f"no {platform} car has {', '.join(missing)}, so the car is without it anyway"
         yield (*at, "without") if "without" in _as_mapping(dict(layers)[at]) else at, words
 
 

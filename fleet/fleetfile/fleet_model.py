@@ -140,11 +140,13 @@ class LimitsEntry(Entry):
     speed_max: float = Field(default=1.0, gt=0, le=1, description="highest speed, as a share of the car's top speed")
     battery_low_v: _Volts = Field(
         default=LOW_V,
-        description="the battery is low below this voltage with the motors off, volts; for three cells, half more",
+        description="the battery is low below this voltage with the motors off, volts; with three cells, 1.5 "
+        "times this",
     )
     battery_critical_v: _Volts = Field(
         default=CRITICAL_V,
-        description="the battery is critical below this voltage with the motors off, volts; for three cells, half more",
+        description="the battery is critical below this voltage with the motors off, volts; with three cells, 1.5 "
+        "times this",
     )
     on_battery_low: BatteryAction = Field(
         default=BatteryAction.WARN,
@@ -152,7 +154,7 @@ class LimitsEntry(Entry):
         "stop the car",
     )
     on_battery_critical: BatteryAction = Field(
-        default=BatteryAction.REFUSE, description="reaction to a critical battery, with the same words"
+        default=BatteryAction.REFUSE, description="reaction to a critical battery, as for a low one"
     )
 
 

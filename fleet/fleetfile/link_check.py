@@ -102,7 +102,7 @@ def check_device(path: str) -> tuple[bool, str]:
     free = "free" if port_lock.LOCKS.exists() else "whether it is free is not known here"
     users = ", ".join(port_lock.find_users(path))
     shared = f", but {users} has it open and may take its bytes: stop that" if users else ""
-    return True, f"there, permitted, {free}{shared}; not opened, which can reset a car"
+    return True, f"there, permitted, {free}{shared}; not opened, because that can reset a car"
 
 
 def _group_name(number: int) -> str:

@@ -15,8 +15,8 @@ from schemas.words import LinkVerdict, Platform
 
 LIKELY_VERDICTS: Final = (LinkVerdict.CAR, "ble", "given")
 POSSIBLE_VERDICTS: Final = (*LIKELY_VERDICTS, LinkVerdict.SILENT, LinkVerdict.BUSY)
-"""Verdicts on links that may be cars. A scan receives nothing from a car that is off, silent, or already has a gateway.
-`ble`: a Bluetooth device with the service of a car's module. `given`: typed by the user and not scanned."""
+"""Verdicts on links that may be cars. A scan receives nothing from a car that is off or silent, or that has a
+gateway. `ble`: a Bluetooth device with the service of a car's module. `given`: typed by the user and not scanned."""
 
 
 class ScanFailed(Exception):
