@@ -84,7 +84,7 @@ class Compare:
 
 @dataclass(frozen=True, slots=True)
 class Not:
-    """`not`."""
+    """A condition that is negated by `not`."""
 
     inner: "Node"
 
@@ -94,7 +94,7 @@ class Not:
 
 @dataclass(frozen=True, slots=True)
 class And:
-    """`and`, of two or more."""
+    """Two or more conditions that are joined by `and`."""
 
     parts: tuple["Node", ...]
 
@@ -104,7 +104,7 @@ class And:
 
 @dataclass(frozen=True, slots=True)
 class Or:
-    """`or`, of two or more."""
+    """Two or more conditions that are joined by `or`."""
 
     parts: tuple["Node", ...]
 
@@ -147,11 +147,11 @@ class Expression:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names that it uses, each once, in the order of the text."""
+        """The names that the condition uses, each once, in the order of the text."""
         return tuple(dict.fromkeys(each.name for each in names_in(self.root)))
 
     def value(self, lookup: Lookup) -> bool | None:
-        """Return whether it is true, or None if that is not known because a value was not measured (None or NaN).
+        """Return whether the condition is true. None if that is not known: a value was not measured (None or NaN).
 
         Raises TypeError if a value is not of its name's type: that is a mistake of the caller.
         """

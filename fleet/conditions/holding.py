@@ -1,6 +1,6 @@
 """Measures for how long a condition has held without a gap. Pure.
 
-`fleet wait --for` feeds it with live readings, `fleet find` with recordings.
+`fleet wait --for` feeds `Holding` with live readings, `fleet find` feeds it with recordings.
 
 The meaning of "for two seconds" depends on what counts as a gap. Between two readings nothing is measured, but this
 time counts as long as the older value is not stale. When a value becomes stale, the condition is evaluated again

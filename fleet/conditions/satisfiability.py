@@ -1,7 +1,7 @@
 """Finds conditions that can never be true. Pure. It may miss some, but each that it finds is never true.
 
 A condition is split into alternatives. Each is a set of comparisons that together make the condition true. An
-alternative is impossible if its comparisons of one field exclude each other, or those of two fields with each other.
+alternative is impossible if its comparisons of one field exclude each other, or if its comparisons of two fields do.
 """
 
 from collections.abc import Iterable
