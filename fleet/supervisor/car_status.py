@@ -15,7 +15,7 @@ from schemas.words import LinkState
 MAX_CARS_LISTED: Final = 8
 """Maximum number of cars that one line lists."""
 READY_TIMEOUT_S: Final = 30.0
-"""A start ends after this time without another ready car, although somebody is missing."""
+"""A start ends if no further car becomes ready for this time, although some are missing."""
 LINK_OPEN_TIMEOUT_S: Final = 10.0
 """The timeout in place of READY_TIMEOUT_S if everything runs, and only links of cars cannot be opened."""
 REACHED_S: Final = 2.0

@@ -194,7 +194,7 @@ class SupervisorService:
 def _proven(identity: str, sender: str, verb: str, refusal: Callable[[str], str]) -> str:
     """Return the sender of a command.
 
-    Raises ReloadRefused if the certificate names another sender, or if it may not.
+    Raises ReloadRefused if the certificate names another sender, or if the sender may not send this command.
     """
     try:
         sender = sender_for(identity, sender, verb)
