@@ -73,7 +73,7 @@ def _page(command: click.Command, name: str) -> str:
         level = "#" if words == name else "##"
         parts.append(f"{level} fleet {words}\n\n{_body(words, each)}")
     if name in gateway.cli.COMMANDS:
-        parts.append(f"[`gateway {name}`]({GATEWAY}#gateway-{name}) is the same for one car.")
+        parts.append(f"[`gateway {name}`]({GATEWAY}#gateway-{name}) does the same.")
     return "\n\n".join(parts) + "\n"
 
 
