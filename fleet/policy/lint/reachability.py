@@ -186,7 +186,7 @@ class ModeReachability:
         ]
         words = f"It waits for {missing} from {whom}"
         if not measuring_modes:
-            return f"{words}, which is measured in no mode."
+            return f"{words}, and no mode measures it."
         they = "it is" if condition.car else "they are"
         only_in = _join_or(measuring_modes)
         return f"{words}, but {they} always in {_join_or(modes)}{where}. A car measures it only in {only_in}."
