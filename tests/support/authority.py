@@ -12,7 +12,10 @@ PLAN = "fixed: {red: {mode: tracking}}\n"
 
 
 def want_for_ever(fleet: FleetProcesses, directory: Path, killed: Sequence[str]) -> list[float]:
-    """Return the times, s after the person's stop, at which motors went on: none. `killed`: victims of each round."""
+    """Return the times, s after the person's stop, at which motors went on. There should be none.
+
+    `killed`: the victims of each round.
+    """
     plan = directory / "plan.yaml"
     plan.write_text(PLAN, encoding="utf-8")
 

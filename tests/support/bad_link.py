@@ -1,7 +1,8 @@
 """A link that loses and delays: `python bad_link.py DEVICE DEVICE LOSS DELAY_S SEED`. Needs Linux and root.
 
-It passes Ethernet frames between two devices of this network namespace, each way with this loss (a share) and delay:
-not each kernel has netem. The kernel must segment and sum before the devices: a frame is what goes over the wire.
+It passes Ethernet frames between two devices of this network namespace, each way with this loss (a share) and delay,
+because not each kernel has netem. The kernel must segment packets and compute their checksums before the devices, so
+that a frame here is a frame on the wire.
 """
 
 import ctypes

@@ -47,7 +47,7 @@ def hold_until_driving(page: Page, judge: Judge) -> None:
 
 
 LEADS_ONLY = "Only a lead may (teacher)."
-"""The one sample of the words for who is no lead, where teacher is the lead."""
+"""The whole text for a person who is not a lead. The lead is teacher."""
 
 
 class ConsoleProcess:

@@ -11,7 +11,10 @@ from gateway import drivers
 
 
 def install_driver(directory: Path, module: str) -> None:
-    """Make a directory, which goes on Python's path, that of a package whose entry point names this module."""
+    """Put into this directory the metadata of a package whose entry point names this module.
+
+    The caller puts the directory on Python's path.
+    """
     found = directory / "tank_driver-1.0.dist-info"
     found.mkdir(parents=True)
     (found / "METADATA").write_text("Metadata-Version: 2.1\nName: tank-driver\nVersion: 1.0\n")

@@ -114,7 +114,7 @@ class Machines:
         return self._start_hub(machine)
 
     def record(self, machine: str, site: str = "") -> tuple[GatewayProcess, Path]:
-        """Start a recorder. Return it and the directory of its sessions. site: of which this machine is the hub."""
+        """Start a recorder. Return it and the directory of its sessions. site: the site whose hub this machine is."""
         place = self.directory / f"sessions-{machine}"
         options = ("--site", site) if site else ()
         recorder = self.start(machine, "-m", "fleet.cli", "record", "run", "--sessions", str(place), "--json", *options)
@@ -122,7 +122,7 @@ class Machines:
         return recorder, place
 
     def check_whole(self, *places: Path) -> None:
-        """Require that each place has one session that is whole, and that they merge into one that is."""
+        """Require that each place has one whole session, and that these sessions merge into a whole one."""
         sessions = [str(session) for place in places for session in place.iterdir() if session.is_dir()]
         assert len(sessions) == len(places), sessions
         merged = self.directory / "merged"

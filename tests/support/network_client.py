@@ -100,7 +100,7 @@ class NetworkDevice:
             ssl=untrusting(),
             proxy=None,
             open_timeout=30,
-            close_timeout=1,  # this client does not read the answer to its closing behind messages that nobody took
+            close_timeout=1,  # the answer to the closing comes after messages that nobody takes, so do not wait for it
             source_address=self.source,
         )
 

@@ -8,7 +8,7 @@ from typing import Final
 
 NOBODY: Final = 65534
 _PASS: Final = 0o011
-"""The right to pass through a directory, of others and of root's group, which stays."""
+"""The right of others, and of root's group, to pass through a directory. The process stays in that group."""
 
 
 @contextmanager

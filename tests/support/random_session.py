@@ -41,7 +41,7 @@ class Mixed:
         self.counts: Counter[str] = Counter()
 
     def put(self, key: str, name: str, payload: bytes, encoding: str = "protobuf") -> None:
-        """Write a message. name: of its type; empty for none."""
+        """Write a message. name: the name of its type; empty for none."""
         if name and (name, encoding) not in self._schemas:
             data = messages.descriptor_set(name) if encoding == "protobuf" else b"{}"
             kind = "protobuf" if encoding == "protobuf" else "jsonschema"
@@ -69,7 +69,7 @@ class Mixed:
 
 
 def make(path: Path, seed: int) -> None:
-    """Write a file of chance, and damage every fourth one."""
+    """Write a random file. One in four is damaged."""
     chance = random.Random(seed)
     options: dict[str, Any] = {
         "chunk_size": chance.choice([200, 2000, 1 << 20]),

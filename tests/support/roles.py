@@ -29,13 +29,13 @@ ABLE: Final = ("red", "green", "blue", "orange", "violet", "white")
 """Cars that have modes. Two of eight simulated cars are Raspberry Pi cars without modes, so one able car is free."""
 HELD: Final = "yellow"
 FILL_S: Final = 3.0
-"""Maximum time until another free car fills a role, or until its only car fills it after a recovery (issue 5)."""
+"""Maximum time until another free car fills a role. If only one car can, it counts from its recovery."""
 NOTICED_S: Final = 4.5
 """Maximum time to notice a reset. Three contradicting frames show a reset, one a second."""
 SHOWN_S: Final = 4.0
 """Maximum time until the car has shown the stop before the next mode. Two block gaps in its reports show a stop."""
 IN_FORCE_S: Final = 3.5 + 1.0
-"""Maximum time from a filled role to its mode: the longest opening (docs/reference/protocol.md#blocking-times), 1 s."""
+"""Maximum time from a role to its mode: the longest opening (docs/reference/protocol.md#blocking-times) and 1 s."""
 STRAY_S: Final = 2.5
 """Maximum time for which motors may be on in mode 0 without a drive.
 

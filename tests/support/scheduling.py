@@ -22,9 +22,9 @@ _MIN_TESTS: Final = 1000
 """Minimum number of tests for workers in the background."""
 _LOWEST_PRIORITY: Final = 19
 _AUTOGROUP: Final = Path("/proc/self/autogroup")
-"""Where Linux takes the priority of a session. With autogroups it shares the processors equally among sessions, and
-`nice` counts within one only: beside two workers at the lowest priority, a gateway in a session of its own got 70 % of
-a processor."""
+"""The file that sets the priority of a session on Linux. With autogroups, Linux shares the processors equally among
+sessions, and `nice` counts only within a session: beside two workers at the lowest priority, a gateway in a session of
+its own got 70 % of a processor."""
 
 _COMPUTING: Final = (
     "tests/deploy/",

@@ -73,7 +73,7 @@ def client_of(credentials: Credentials, identity: str) -> Iterator[zenoh.Session
 
 
 def ask(session: zenoh.Session, key: str, timeout_s: float = 5.0, **fields: Any) -> list[dict[str, Any]]:
-    """Send a command in JSON to a key. Return the answers; an error is one with the words only."""
+    """Send a command in JSON to a key. Return the answers. For an error, the answer has only the words."""
     replies = session.get(
         key,
         target=zenoh.QueryTarget.ALL,

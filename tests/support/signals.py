@@ -1,4 +1,4 @@
-"""Signals of the processes that tests start, whatever the one who runs the tests ignores (`nohup`, a script's `&`)."""
+"""Gives the processes that tests start the usual signals, even if a shell ignores some (`nohup`, a script's `&`)."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ _NUMBERS: Final = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
 def give_default_signals() -> None:
     """Let each process that is started from now on get the default of the signals that end it. Main thread only.
 
-    SIGINT becomes what it is at a terminal here, too. The others stay without effect on this process.
+    In this process, SIGINT does what it does at a terminal, too. The others stay without effect.
     """
     # An ignored signal stays ignored in every child. A handler does not: at its exec, a child gets the default.
     # A worker of pytest-xdist is such a child. It ends with its controller, so no closed terminal may end it before.
@@ -22,4 +22,4 @@ def give_default_signals() -> None:
 
 
 def _no_effect(*_: object) -> None:
-    """Take a signal that who runs the tests wants to be ignored."""
+    """Ignore a signal that was ignored before."""

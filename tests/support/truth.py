@@ -23,7 +23,7 @@ def _box(metres: float) -> tuple[Segment, ...]:
 
 
 RENEWED_S = 26.0
-"""Time after which control has ended its renewals of an unshown rest with `MODE00`."""
+"""Time after which control no longer repeats `MODE00` to a car that has not shown that it is at rest."""
 WORLDS: dict[str, Callable[[], World]] = {"room": World.room, "no-echo": World.open_field, "near-walls": near_walls}
 
 
@@ -35,7 +35,7 @@ def frame_of(mode: Mode) -> bytes:
 def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> Pair:
     """Return a car that has been in a mode for a while, with no frame of control pending.
 
-    Control first renews an unshown rest with `MODE00`, which would end another mode.
+    A car that has not shown that it is at rest first gets repeats of `MODE00`, which would end the mode.
     """
     moments = random.Random(seed)
     pair = Pair(platform, seed=seed, world=WORLDS[world](), start_s=1.0 + moments.random()).ready()
