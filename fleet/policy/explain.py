@@ -269,7 +269,7 @@ def explain_vacancy(
     if others.kinds:
         cannot = f"no {'other ' if holders else ''}car can"
         why = f"{'no car is left for it' if others.has_able else cannot}: {others.words}"
-        change = "one of them is left for it, or becomes able to" if others.has_able else others.changes
+        change = "one of them is left for it, or becomes able to take it" if others.has_able else others.changes
     elif {*candidates.free, *barriers} - {*holders}:
         why, change = "the plan gives it to no other car that is there", "a car comes up that may have it"
     else:

@@ -127,7 +127,7 @@ def _probes_in_mode_0(facts: StopFacts) -> bool:
 LEFT_SHAPE: Final = StopCase(
     "left_shape",
     "full stop, out of a mode in which the car sent readings",
-    "one report of mode 0 that the car began after it obeyed `MODE00`, and that comes within the block and one "
+    "one mode-0 report that the car began after it obeyed `MODE00`, and that comes within the block and one "
     "interval. No other frame was sent since the mode was seen. A report that comes up to 0.2 s later counts as one "
     "block gap. In all other cases as in mode 0",
     "the stop goes on",
