@@ -5,11 +5,16 @@ writes, so one layout shows both. Nobody who is slow, or publishes nonsense, may
 Foxglove does not read, the SDK drops its oldest messages, and no other client notices. If we are slower than the bus,
 Zenoh's queue for us fills, and the hub drops messages for us. If a program publishes messages that are not protobuf of
 this version, they are counted, and named at the end. The number of topics is bounded.
+
+The SDK (0.30) tells its clients of a new channel a moment before it knows the channel itself. A client that subscribes
+at once is refused, and does not try again. So a channel that refused somebody is closed and opened under a new number.
 """
 
 import logging
+import re
 import time
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Container
 from typing import Final
 
 import foxglove
@@ -37,11 +42,17 @@ OTHER_KEYS: Final = "other keys"
 _QUEUE_SIZE: Final = 16_384
 """Maximum number of messages in the queue of one subscription: three seconds of 100 cars."""
 _MAX_BATCH: Final = 4096
+MAX_REOPENED: Final = 10
+"""How often a topic gets a new channel because one refused a client. A client may subscribe to any numbers."""
+_REFUSED: Final = re.compile(r"subscribe to unknown channel: (\d+)")
+"""The SDK's log message about a client that it refused."""
 _LAST_TIMEOUT_S: Final = 3.0
 """Timeout for the last message of a topic that is published only on change. If no process can answer, nobody waits."""
 
 # The SDK logs an error for each message to a client that has gone without closing its connection.
-logging.getLogger("foxglove").setLevel(logging.CRITICAL + 1)
+_sdk_log = logging.getLogger("foxglove")
+_sdk_log.propagate = False
+_sdk_log.addHandler(logging.NullHandler())
 
 
 class PortInUse(Exception):
@@ -58,9 +69,13 @@ class FoxgloveServer:
         self._client = client
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
-        self._last: dict[int, tuple[bytes, int]] = {}
-        """The last message of each channel of states or events, and its time."""
+        self._last: dict[str, tuple[bytes, int]] = {}
+        """The last message of each topic of states or events, and its time."""
         self._names = TopicNames()
+        self._topics: dict[int, str] = {}
+        """The topic of each channel, by the channel's number."""
+        self._reopened: Counter[str] = Counter()
+        """How often each topic got a new channel."""
         self.left_out = LeftOut()
         """Messages that have no topic."""
         self._listener = _Listener(self._on_subscribe)
@@ -76,6 +91,7 @@ class FoxgloveServer:
             )
         except RuntimeError as error:  # the SDK's FoxgloveError
             raise PortInUse(str(error).partition(": ")[2] or str(error)) from None
+        self._refusals = _Refusals()
         self._subscribers = [
             client.bus.subscribe_channel(expression, _QUEUE_SIZE) for expression in keys.recorded_keys(client.name)
         ]
@@ -98,6 +114,7 @@ class FoxgloveServer:
                     break
                 count += 1
                 self._log(sample_of(sample))
+        self._reopen_refusing()
         return count
 
     def close(self) -> None:
@@ -105,6 +122,7 @@ class FoxgloveServer:
         for subscriber in self._subscribers:
             subscriber.undeclare()
         self._server.stop()
+        self._refusals.close()
 
     def _log(self, sample: Sample) -> None:
         if sample.deleted:
@@ -118,7 +136,7 @@ class FoxgloveServer:
         # A client learns of a topic by its first message, so it subscribes only after this message was sent. Store the
         # message before it is sent: a client that subscribes in between then gets it twice rather than not at all.
         if self._is_kept(sample):
-            self._last[channel.id()] = sample.payload, now_ns
+            self._last[channel.topic()] = sample.payload, now_ns
         channel.log(sample.payload, log_time=now_ns)
 
     @staticmethod
@@ -142,15 +160,33 @@ class FoxgloveServer:
             return LeftOutCause.TOO_MANY_TOPICS
         topic = self._names.name(sample.key, kind, "protobuf", *schema)
         if topic not in self._channels:
-            made = foxglove.Schema(name=kind, encoding="protobuf", data=schema[2])
-            self._channels[topic] = foxglove.Channel(
-                topic, schema=made, message_encoding="protobuf", context=self._context
-            )
+            self._channels[topic] = self._open(topic, foxglove.Schema(name=kind, encoding="protobuf", data=schema[2]))
         return self._channels[topic]
+
+    def _open(self, topic: str, schema: foxglove.Schema | None) -> foxglove.Channel:
+        opened = foxglove.Channel(topic, schema=schema, message_encoding="protobuf", context=self._context)
+        self._topics[opened.id()] = topic
+        return opened
+
+    def _reopen_refusing(self) -> None:
+        """Give each topic whose channel refused a client a new one, which all clients hear of."""
+        for number in self._refusals.take(self._topics):
+            topic = self._topics[number]
+            if self._reopened[topic] == MAX_REOPENED:
+                continue
+            self._reopened[topic] += 1
+            del self._topics[number]
+            old = self._channels[topic]
+            schema = old.schema()
+            old.close()  # else the SDK would give us the same one
+            new = self._channels[topic] = self._open(topic, schema)
+            if topic in self._last:  # a client that has just subscribed got it on the old channel, if at all
+                payload, at_ns = self._last[topic]
+                new.log(payload, log_time=at_ns)
 
     def _on_subscribe(self, client: Client, channel: ChannelView) -> None:
         """Send the last message to a client that subscribes to states or events. Runs on a thread of the SDK."""
-        if (last := self._last.get(channel.id)) is None:
+        if (last := self._last.get(channel.topic)) is None:
             return
         payload, at_ns = last
         self._channels[channel.topic].log(payload, log_time=at_ns, sink_id=client.id)
@@ -165,6 +201,33 @@ class _Listener(ServerListener):
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
         """Call the function for subscriptions."""
         self._on_subscribe(client, channel)
+
+
+class _Refusals(logging.Handler):
+    """Collects from the SDK's log the channels that refused a client."""
+
+    MAX_REFUSALS: Final = 1024
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._found: deque[int] = deque(maxlen=self.MAX_REFUSALS)
+        _sdk_log.addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Note the channel of a refusal. Runs on a thread of the SDK."""
+        if found := _REFUSED.search(record.getMessage()):
+            self._found.append(int(found[1]))
+
+    def take(self, known: Container[int]) -> set[int]:
+        """Return those of the `known` channels that refused a client. Keep the others: they may still be opened."""
+        found = [self._found.popleft() for _ in range(len(self._found))]
+        self._found.extend(each for each in found if each not in known)
+        return {each for each in found if each in known}
+
+    def close(self) -> None:
+        """Stop collecting."""
+        _sdk_log.removeHandler(self)
+        super().close()
 
 
 def layout_now(client: Fleet) -> str:

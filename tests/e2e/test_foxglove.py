@@ -4,14 +4,18 @@ import asyncio
 import base64
 import json
 import struct
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import foxglove
 import websockets
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
+from fleet.bridges.foxglove_server import FoxgloveServer
+from fleet.client.client import Fleet as Client
 from schemas import keys, messages
 from schemas.commands import Verb
 from schemas.gen import fleet_v1_pb2 as pb
@@ -33,7 +37,7 @@ class Channel(NamedTuple):
 
 
 class FoxgloveClient:
-    """A client of the subprotocol foxglove.sdk.v1."""
+    """A client of the subprotocol foxglove.sdk.v1. As Foxglove, it subscribes to each new channel of a wanted topic."""
 
     def __init__(self, socket: websockets.ClientConnection) -> None:
         self.socket = socket
@@ -41,22 +45,27 @@ class FoxgloveClient:
         self.channels: dict[str, Channel] = {}
         self.came: dict[str, list[bytes]] = {}
         self.statuses: list[dict[str, Any]] = []
+        self._wanted: set[str] = set()
         self._topics: dict[int, str] = {}
 
     async def until(self, so: Callable[[], Any], what: str) -> None:
         async with asyncio.timeout(PATIENCE_S):
             while not so():
-                self._take(await self.socket.recv())
+                await self._take(await self.socket.recv())
         assert so(), what
 
     async def subscribe(self, topic: str) -> None:
         await self.until(lambda: topic in self.channels, f"{topic} is advertised")
+        self._wanted.add(topic)
+        await self._subscribe_to_channel(topic)
+
+    async def _subscribe_to_channel(self, topic: str) -> None:
         channel = self.channels[topic].id
         self._topics[channel] = topic
         wanted = {"op": "subscribe", "subscriptions": [{"id": channel, "channelId": channel}]}
         await self.socket.send(json.dumps(wanted))
 
-    def _take(self, frame: str | bytes) -> None:
+    async def _take(self, frame: str | bytes) -> None:
         if isinstance(frame, bytes):
             kind, subscription, _ = struct.unpack_from("<BIQ", frame)
             assert kind == MESSAGE_DATA
@@ -70,6 +79,8 @@ class FoxgloveClient:
                 for each in said["channels"]:
                     assert (each["encoding"], each["schemaEncoding"]) == ("protobuf", "protobuf")
                     self.channels[each["topic"]] = Channel(each["id"], each["schemaName"], each["schema"])
+                    if each["topic"] in self._wanted:
+                        await self._subscribe_to_channel(each["topic"])
             case "status":
                 self.statuses.append(said)
 
@@ -132,6 +143,42 @@ def test_a_client_reads_a_car_live_with_its_schemas(tmp_path: Path) -> None:
         assert "fleet/red/sensor/range.range_m" in "\n".join(layout.lines())
         assert server.end() == 0
         assert server.stderr == ""
+
+
+def test_refused_client_gets_new_channel(fleet: FleetProcesses) -> None:
+    """The SDK refuses a client that is too fast. Here it subscribes before there is a channel, so that it surely is."""
+    with Client(fleet.endpoint) as viewer:
+        server = FoxgloveServer(viewer, "127.0.0.1", 0)
+        number = foxglove.Channel("before", message_encoding="json", context=foxglove.Context()).id() + 1
+        battery = keys.topic_key("fleet", "red", "sensor/battery")
+        ended = threading.Event()
+
+        def serve_and_publish() -> None:
+            while not ended.wait(0.02):
+                payload = pb.Battery(voltage_v=7.4).SerializeToString()
+                fleet.bus.put_again(battery, payload, TOPICS["sensor/battery"].encoding, 0, Qos.READING)
+                server.step()
+
+        async def look() -> None:
+            async with foxglove_client(f"ws://127.0.0.1:{server.port}") as client:
+                wanted = {"op": "subscribe", "subscriptions": [{"id": number, "channelId": number}]}
+                await client.socket.send(json.dumps(wanted))
+                await client.until(lambda: client.statuses, "it is refused")
+                stepping = asyncio.create_task(asyncio.to_thread(serve_and_publish))
+                try:
+                    await client.until(lambda: battery in client.channels, "the channel is there")
+                    assert client.channels[battery].id == number
+                    await client.until(lambda: client.channels[battery].id != number, "there is a new one")
+                    await client.subscribe(battery)
+                    await client.until(lambda: client.came.get(battery), "a battery")
+                finally:
+                    ended.set()
+                    await stepping
+
+        try:
+            asyncio.run(look())
+        finally:
+            server.close()
 
 
 def test_odd_messages_and_stalled_client_disturb_nobody(tmp_path: Path, fleet: FleetProcesses) -> None:
