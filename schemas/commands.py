@@ -1,10 +1,9 @@
 """The one table of commands: verb, message, description, text of the outcome, wildcard, maximum age, limits. Pure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 
 class Verb(StrEnum):
@@ -29,8 +28,7 @@ class Verb(StrEnum):
     FIND = "find"
 
 
-@dataclass(frozen=True, slots=True)
-class CommandType:
+class CommandType(NamedTuple):
     """One row: a command under `<fleet>/<car>/@cmd/<verb>`."""
 
     verb: Verb

@@ -1,8 +1,7 @@
 """Builds, parses and checks keys, key expressions and names. Pure. `topics` lists the topics under the keys."""
 
 import re
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 DEFAULT_FLEET: Final = "fleet"
 NAME_RULE: Final = "1 to 32 of a-z, 0-9, _ and -, beginning with a letter or digit"
@@ -56,8 +55,7 @@ def describe_fleet(fleet: str) -> str:
     return "the fleet" if fleet == DEFAULT_FLEET else f"fleet {fleet}"
 
 
-@dataclass(frozen=True, slots=True)
-class Key:
+class Key(NamedTuple):
     """The parts of a concrete key: `fleet/red/sensor/range` is (fleet, red, sensor/range)."""
 
     fleet: str

@@ -3,10 +3,9 @@
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 from schemas.suggestion import nearest
 from schemas.words import UNKNOWN, Basis, BatteryLevel, LinkState, Mode, Motion, MotionSource, Motors, Verdict
@@ -28,8 +27,7 @@ class Qos(StrEnum):
     COMMAND = "command"  # overtakes everything, sent at once
 
 
-@dataclass(frozen=True, slots=True)
-class Topic:
+class Topic(NamedTuple):
     """One row of the table: the messages under `<fleet>/<car>/<name>`."""
 
     name: str
@@ -41,11 +39,11 @@ class Topic:
     """Maximum expected rate. 0 for events."""
     stale_after_s: float | None = None
     """Age at which a value is stale. None if it never expires."""
-    units: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = MappingProxyType({})
     """Units by field, for fields with a unit."""
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    ranges: Mapping[str, tuple[float, float]] = MappingProxyType({})
     """Lowest and highest published value by field (docs/reference/protocol.md#readings)."""
-    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    words: Mapping[str, tuple[str, ...]] = MappingProxyType({})
     """The possible words by field, for fields whose value is one of a few words."""
     recorded: bool = True
     entity: str = ""

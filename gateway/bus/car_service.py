@@ -8,9 +8,8 @@ queue, and queries of the history in another one.
 """
 
 import time
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
@@ -40,8 +39,7 @@ RIVAL_TIMEOUT_S: Final = 3.0
 """Timeout for another gateway's answer. Within it, a stalled gateway answers, or loses its Zenoh lease (2 s)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Request:
+class Request(NamedTuple):
     """One command as the bus delivered it: a query, or one sample of a stream."""
 
     verb: str

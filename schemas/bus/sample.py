@@ -2,8 +2,7 @@
 
 import time
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import zenoh
 
@@ -23,8 +22,7 @@ LONGEST_SELECTOR: Final = 4096
 """Maximum length of a query's selector (key and parameters), and of its encoding."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
+class Sample(NamedTuple):
     """One publication or reply, with the payload's bytes."""
 
     key: str
@@ -51,8 +49,7 @@ class Sample:
         return messages.parse(name if topic is None else topic.message, self.payload, self.encoding)
 
 
-@dataclass(frozen=True, slots=True)
-class Failure:
+class Failure(NamedTuple):
     """An error reply."""
 
     words: str

@@ -1,6 +1,5 @@
 """Subcommands that a row of the table of commands describes."""
 
-from dataclasses import replace
 from typing import Any
 
 import click
@@ -12,7 +11,7 @@ from fleet.commands import actuators
 from schemas.commands import COMMANDS
 
 PLAIN = [row for row in COMMANDS.values() if row.subcommand]
-HORN = replace(COMMANDS["whistle"], min_duration_s=0.5, max_duration_s=10.0, subcommand="horn")
+HORN = COMMANDS["whistle"]._replace(min_duration_s=0.5, max_duration_s=10.0, subcommand="horn")
 """A row with a duration. No verb of a car has one and needs no rules."""
 
 

@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import pytest
@@ -136,13 +136,13 @@ def test_signal_message_has_duration_at_most() -> None:
 
 def test_signal_duration_has_limit_of_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     """Made from `lend`, whose message has a duration."""
-    monkeypatch.setattr(command_parser, "COMMANDS", {**COMMANDS, "lend": replace(COMMANDS["lend"], signal=True)})
+    monkeypatch.setattr(command_parser, "COMMANDS", {**COMMANDS, "lend": COMMANDS["lend"]._replace(signal=True)})
     monkeypatch.delitem(command_parser._WHAT, "lend")
     assert ask("lend", {"duration_s": 86_400}).what == Signal(Verb.LEND, 86_400.0)
     for wrong in (86_401, 0, -1, "NaN", "Infinity"):
         assert "duration_s" in refused("lend", {"duration_s": wrong}).words
     assert "duration_s 0: " in refused("lend", {}).words
-    row = replace(COMMANDS["lend"], signal=True, min_duration_s=2.0)
+    row = COMMANDS["lend"]._replace(signal=True, min_duration_s=2.0)
     monkeypatch.setattr(command_parser, "COMMANDS", {**COMMANDS, "lend": row})
     assert ask("lend", {"duration_s": 2}).what == Signal(Verb.LEND, 2.0)
     assert "duration_s 1.9: " in refused("lend", {"duration_s": 1.9}).words
