@@ -45,7 +45,8 @@ def shared_ports(links: Mapping[str, FleetLink]) -> Iterator[tuple[str, str]]:
         port, possible = link.port_key, list(link.possible_ports())
         # Two USB links may be one device if one of the two gives all ids of the other.
         earlier = [by_port[each] for each in possible if each in by_port]
-        earlier += [by_possible[port]] if port in by_possible else []
+        if port in by_possible:
+            earlier.append(by_possible[port])
         if earlier:
             yield min(earlier, key=order.__getitem__), car
         by_port.setdefault(port, car)

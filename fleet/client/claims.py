@@ -67,7 +67,7 @@ class CarClaim:
         return f"{self.short}{since}{f': {self.why}' if self.why else ''}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the claim as JSON values."""
         return {
             "what": self.what,
             "basis": self.basis or None,
@@ -112,7 +112,7 @@ def rest_words(motors: CarClaim, car: str) -> str:
     return ", ".join(filter(None, (STOP_SENT, motors.why)))
 
 
-def is_bad_rest(words: str) -> bool:
+def may_still_move(words: str) -> bool:
     """Return True if these words about a car's last stop say that the car may be moving."""
     return words.startswith((NOT_STOPPED, NOT_CONFIRMED))
 

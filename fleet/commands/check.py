@@ -65,14 +65,15 @@ Exit codes: 0 no mistakes, 1 a car's port is missing or a part of a plan can nev
 def check(files: tuple[Path, ...], *, as_json: bool) -> None:
     """Check fleet files, plans and worlds (default: fleet.yaml), and whether each car's port exists and is free.
 
-    The command does not touch the cars. For a fleet file, it also checks the plan and the world in it, for the cars in
-    that file. It warns if a Bluetooth adapter has more cars than the adapter can connect at once.
+    The command does not touch the cars. If a fleet file names a plan or a world, the command checks it for the cars of
+    that fleet. It warns if a Bluetooth adapter has more cars than the adapter can connect at once.
     """
     checks = _Checks(as_json=as_json)
     kinds = {file: checks.recognize(file) for file in files or (DEFAULT_FILE,)}
     for kind in FileKind:  # fleet files first, because plans are checked for the cars in them
-        for file in (each for each, its in kinds.items() if its is kind):
-            checks.check(kind, file)
+        for file, recognized in kinds.items():
+            if recognized is kind:
+                checks.check(kind, file)
     raise SystemExit(int(checks.result))
 
 
@@ -84,7 +85,7 @@ class _Checks:
         self._as_json = as_json
         self._cars: _Cars = None
         self._simulated: list[str] = []
-        """The cars that may carry things of a world. If the list is empty, any car may."""
+        """The cars that `carried_by` in a world may name. If the list is empty, it may name any car."""
         self._done: set[Path] = set()
 
     def recognize(self, file: Path) -> FileKind | None:
@@ -118,20 +119,20 @@ class _Checks:
         fleet = read_fleet(file)
         if self._cars is None:
             self._cars = listed_cars(fleet)
-            # `fleet up --sim N` also simulates cars that have a port.
+            # If no car has the link `sim`, take all: `fleet up --sim N` simulates cars that have a port, too.
             self._simulated = [name for name, car in fleet.cars.items() if car.link == LINK_SIM] or list(fleet.cars)
-        served = _running_links(fleet)
+        running_links = _running_links(fleet)
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-            found = list(pool.map(lambda car: check_link(car, served), fleet.cars.values()))
+            found = list(pool.map(lambda car: check_link(car, running_links), fleet.cars.values()))
         widest = max(len(each.car) for each in found)
         for each in found:
             state = "ok" if each.ok else "error"
             self._print(asdict(each), f"{each.car:{widest}}  {state:5}  {each.link}: {each.words}")
             self._worse(_Result.GOOD if each.ok else _Result.FAILED)
         links = {name: parse_fleet_link(car.link) for name, car in fleet.cars.items()}
-        for sums in check_adapters(links, list_adapters()):
-            if sums.is_crowded:
-                self._print(asdict(sums), f"{sums.adapter:{widest}}  warn   {sums.words}")
+        for load in check_adapters(links, list_adapters()):
+            if load.is_crowded:
+                self._print(asdict(load), f"{load.adapter:{widest}}  warn   {load.words}")
         for kind, path in ((FileKind.PLAN, fleet.plan), (FileKind.WORLD, fleet.world)):
             if path is not None:
                 self.check(kind, path)
@@ -208,7 +209,7 @@ def _is_world(cars: Any) -> bool:
 
 
 def _running_links(fleet: FleetFile) -> dict[str, tuple[str, str, str]]:
-    """Return state, reason and URL of the link of every running gateway. Empty if no fleet is running."""
+    """Return, for the car of each running gateway, the state, reason and URL of its link. Empty if no fleet runs."""
     from fleet.client.client import Fleet
 
     with cli_errors():

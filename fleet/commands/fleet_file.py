@@ -1,4 +1,7 @@
-"""`fleet init, schema`: writes and describes fleet files. Other commands read them with its functions. No car moves."""
+"""`fleet init, schema`: writes and describes fleet files. For other commands, reads them and asks the user.
+
+No car moves.
+"""
 
 import json
 import re
@@ -73,7 +76,7 @@ def print_schema(kind: str) -> None:
 
 
 def schema_text(kind: str) -> str:
-    """Return the JSON Schema of a kind of file as it is checked in."""
+    """Return the JSON Schema of a kind of file: the text of `deploy/KIND.schema.json`."""
     from fleet.policy.plan.plan_model import PlanEntry
 
     models: dict[str, type[Entry]] = {"fleet": FileEntry, "plan": PlanEntry, "world": WorldEntry}
@@ -155,7 +158,7 @@ def init(
 
 
 def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:
-    """Scan for cars, likely ones first. An error becomes one line."""
+    """Scan for cars, and return the likely ones first. Raises click.ClickException if the scan fails."""
     try:
         found = scan(links, seconds)
     except ScanFailed as error:
@@ -164,7 +167,7 @@ def look_for(links: tuple[str, ...], seconds: float | None) -> list[FoundLink]:
 
 
 def write(path: Path, text: str) -> None:
-    """Write or replace a file atomically, with the text's line ends."""
+    """Write or replace a file atomically. The line ends of the text stay as they are."""
     path = path.resolve()
     try:
         write_atomically(path, text.encode())
@@ -212,9 +215,9 @@ def prompt_name(words: str, offered: str | None, taken: set[str], instead: str =
         name = name.strip()
         if name in taken:
             raise click.UsageError(f"{name} is already the name of another car")
-        likely = re.sub("[^a-z0-9_]+", "-", name.lower()).strip("-_")
-        if name != likely and name != _SKIP and keys.is_name(likely):
-            raise click.UsageError(f'"{name}" is not a car name: use {keys.NAME_RULE}, such as {likely}.')
+        proposed = re.sub("[^a-z0-9_]+", "-", name.lower()).strip("-_")
+        if name != proposed and name != _SKIP and keys.is_name(proposed):
+            raise click.UsageError(f'"{name}" is not a car name: use {keys.NAME_RULE}, such as {proposed}.')
         return name if name == _SKIP else _prompt_check(validate_car_name)(name)
 
     name: str = prompt(words, default=offered, value_proc=check_name, instead=instead)
@@ -251,7 +254,7 @@ def _error_without_answer(error: click.Abort, instead: str) -> click.Abort | cli
 
 
 def _prompt_check(rule: Callable[[str], str]) -> Callable[[str], str]:
-    """Return the rule as a value processor of a prompt, which repeats the question after an error."""
+    """Return a function that applies the rule to an answer. After an error of it, `prompt` repeats its question."""
 
     def check(text: str) -> str:
         try:

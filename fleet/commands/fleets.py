@@ -17,11 +17,11 @@ from schemas.words import Rank
 
 
 def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
-    """Return the fleets that a command for these cars could mean if it names no fleet. The default is `fleet`."""
+    """Return the fleets that a command for these cars could mean. If at most one runs on the bus, return `fleet`."""
     found = fleets_on(bus)
     if len(found) < 2:
         return [fleet]
-    if click.get_current_context(silent=True) is not None:  # the thread of a stop has no context
+    if click.get_current_context(silent=True) is not None:  # `in_all_fleets` calls this in a thread, without context
         name_fleet_in_hints()
     wanted = {each for each in cars if each != ALL_CARS and not each.startswith("@")}
     return sorted(name for name, members in found.items() if wanted <= members) or sorted(found)
@@ -32,29 +32,29 @@ def the_fleet(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> str:
 
     Without a terminal, raise click.UsageError.
     """
-    could = [fleet] if is_named() else candidates(bus, fleet, cars)
-    if len(could) == 1:
-        return could[0]
+    possible = [fleet] if is_named() else candidates(bus, fleet, cars)
+    if len(possible) == 1:
+        return possible[0]
     if sys.stdin.isatty() and sys.stdout.isatty():
-        chosen: str = click.prompt("Which fleet?", type=click.Choice(could), err=True)
+        chosen: str = click.prompt("Which fleet?", type=click.Choice(possible), err=True)
         return chosen
-    raise _ambiguous(could)
+    raise _ambiguous(possible)
 
 
 def client_in(connect: str | None, fleet: str) -> Fleet:
-    """Open the client of the person whom --as or FLEET_AS names, in exactly this fleet."""
+    """Open a client in exactly this fleet, for the person whom --as or FLEET_AS names."""
     return Fleet(connect, fleet, kind=Rank.PERSON, person=chosen_person())
 
 
 def open_client(connect: str | None, fleet: str, cars: Iterable[str] = ()) -> Fleet:
-    """Open the client of `client_in` in the fleet that the command means. Raises click.UsageError."""
+    """Open a client as `client_in` does, in the fleet that the command means. Raises click.UsageError."""
     return _open_chosen(connect, fleet, lambda bus: the_fleet(bus, fleet, cars))
 
 
 def open_observer(connect: str | None, fleet: str, keyexpr: str = "") -> Fleet:
-    """Open the client of `client_in` for a key expression as the user wrote it.
+    """Open a client as `client_in` does, for a key expression that the user wrote.
 
-    Raises click.UsageError if several fleets could fit.
+    Raises click.UsageError if the expression could mean several fleets.
     """
     return _open_chosen(connect, fleet, lambda bus: _only_fleet(bus, fleet, keyexpr.partition("/")[0]))
 
@@ -76,26 +76,31 @@ def _open_chosen(connect: str | None, fleet: str, choose: Callable[[Bus], str]) 
 
 def _only_fleet(bus: Bus, fleet: str, first: str) -> str:
     """Return this fleet. Fail if a key expression that begins with `first` could mean another fleet, too."""
-    if not (is_named() or first in ("**", fleet)):
-        could = candidates(bus, fleet, [first] if first and not set(first) & set("*$") else ())
-        if could != [fleet]:
-            raise _ambiguous(could)
+    if is_named() or first in ("**", fleet):
+        return fleet
+    has_wildcard = bool(set(first) & set("*$"))
+    possible = candidates(bus, fleet, [first] if first and not has_wildcard else ())
+    if possible != [fleet]:
+        raise _ambiguous(possible)
     return fleet
 
 
-def _ambiguous(could: Iterable[str]) -> click.UsageError:
-    return click.UsageError(f"Several fleets are on this bus: {', '.join(could)}. Say which one with --fleet NAME.")
+def _ambiguous(possible: Iterable[str]) -> click.UsageError:
+    return click.UsageError(f"Several fleets are on this bus: {', '.join(possible)}. Say which one with --fleet NAME.")
 
 
 def in_all_fleets(
     client: Fleet, connect: str | None, cars: Sequence[str], act: Callable[[Fleet], Sequence[Outcome]]
 ) -> list[Outcome]:
-    """Stop the cars in this client's fleet at once, and meanwhile in every other fleet that the command could mean."""
+    """Stop the cars in this client's fleet, and meanwhile those in every other fleet that the command could mean.
+
+    `act` stops the cars in the fleet of a client, and returns their outcomes.
+    """
     is_explicit = is_named()
 
     def elsewhere() -> list[Outcome]:
-        could = [client.name] if is_explicit else candidates(client.bus, client.name, cars)
-        others = [name for name in could if name != client.name]
+        possible = [client.name] if is_explicit else candidates(client.bus, client.name, cars)
+        others = [name for name in possible if name != client.name]
         if not others:
             return []
         with ThreadPoolExecutor(len(others)) as pool:

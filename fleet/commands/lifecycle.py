@@ -11,7 +11,7 @@ from typing import IO, Any, Final
 
 import click
 
-from fleet.client.claims import is_bad_rest
+from fleet.client.claims import may_still_move
 from fleet.client.client import certified_sender
 from fleet.client.services import ask_recorder
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
@@ -110,7 +110,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
         last, gone = _until_ended(bus, fleet, received)
     results = dict(last.became) if last is not None else {}
     ended = last is not None and last.state == RunState.ENDED
-    bad = sorted(car for car, words in results.items() if is_bad_rest(words))
+    bad = sorted(car for car, words in results.items() if may_still_move(words))
     unrecorded = last.unrecorded if last is not None else ""
     if as_json:
         click.echo(json.dumps({"ended": ended, "cars": results, "unrecorded": unrecorded}))
@@ -122,14 +122,16 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
     if not ended:
         what = "ended without reporting" if gone else f"has not ended after {FLEET_DOWN_TIMEOUT_S:g} s"
         raise click.ClickException(
-            f"`fleet up` {what}. Cars may still be moving: check them. Then `fleet status` and `fleet logs supervisor`."
+            f"`fleet up` {what}. Cars may still be moving: check them. "
+            "Then type `fleet status` and `fleet logs supervisor`."
         )
     raise SystemExit(1 if bad or unrecorded else 0)
 
 
 def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> tuple[Any, bool]:
     """Wait for the end of the shutdown. Return the last status, and whether the supervisor is gone."""
-    deadline, last_sign_at = time.monotonic() + FLEET_DOWN_TIMEOUT_S, time.monotonic()
+    deadline = time.monotonic() + FLEET_DOWN_TIMEOUT_S
+    last_sign_at = time.monotonic()  # a new status, or the supervisor's token on the bus, is a sign of life
     count, gone = 0, False
     while time.monotonic() < deadline and not gone:
         if len(received) != count:
@@ -168,7 +170,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
 
 
 def _complete_logs(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
-    """Return, for the shell, the cars and services that have a log of the last run here."""
+    """Complete, in the shell, the name of a car or service that has a log of the last run on this machine."""
     fleet = ctx.params.get("fleet") or ctx.find_root().params.get("fleet") or keys.DEFAULT_FLEET
     connect = ctx.params.get("connect") or ctx.find_root().params.get("connect")
     with suppress(click.ClickException, ValueError, OSError):
@@ -221,7 +223,7 @@ def _log_directory(connect: str | None, fleet: str) -> Path:
 
 
 def _last_run(connect: str | None, fleet: str) -> Path:
-    """Return the log directory of the last run here."""
+    """Return the log directory of the last run on this machine."""
     place = runs_directory(fleet, resolve_endpoint(connect))
     # A run that was refused has no logs.
     runs = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []

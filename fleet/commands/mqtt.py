@@ -16,7 +16,7 @@ from fleet.commands.fleets import open_observer
 from fleet.commands.options import bus_options
 from fleet.commands.output import echo_safely
 
-PASSWORD_VARIABLE: Final = "FLEET_MQTT_PASSWORD"  # noqa: S105 - its name
+PASSWORD_VARIABLE: Final = "FLEET_MQTT_PASSWORD"  # noqa: S105 - the name of the variable
 """The password is not an option, because everybody on this computer can read a command line."""
 
 

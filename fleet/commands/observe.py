@@ -197,15 +197,15 @@ def cell_text(name: str, row: Mapping[str, Any]) -> str:
     if name == "ready":
         return "ready" if row["ready"] else row["why_not_ready"] or "-"
     if name == "motors":
-        return _cell(row, name)
+        return _claim_text(row, name)
     if name == "shows stops":
         return "in doubt" if row["doubted"] else _SHOWS.get(row["shows_stops"], "-")
     old = " (stale)" if name in ("link", "mode", "motion") and f"state/{name}" in row["stale"] else ""
     return f"{row[name]}{old}" if row[name] else "-"
 
 
-def _cell(row: Mapping[str, Any], name: str) -> str:
-    """Return the cell of a claim: the claim, its basis, and `stale` if it is old."""
+def _claim_text(row: Mapping[str, Any], name: str) -> str:
+    """Return a claim as the text of a cell: the claim, its basis, and `stale` if it is old."""
     if row[name] is None:
         return "-"
     basis = [row["claims"][name]["basis"], "stale" if "state/safety" in row["stale"] else None]
@@ -275,8 +275,9 @@ def _show(readings: Sequence[Reading], *, csv_of: topics.Topic | None, as_json: 
 def _print_shortfalls(lines: Sequence[str]) -> None:
     """Print why there are fewer readings than requested, for at most a few keys."""
     limit = _MAX_SHORTFALL_LINES
-    more = [f"and {len(lines) - limit} more likewise"] if len(lines) > limit + 1 else lines[limit : limit + 1]
-    for words in (*lines[:limit], *more):
+    if len(lines) > limit + 1:
+        lines = [*lines[:limit], f"and {len(lines) - limit} more likewise"]
+    for words in lines:
         say(f"fleet: {words}", err=True)
 
 
@@ -300,7 +301,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     """
     key_expression = check_key(written_out(keyexpr, fleet))
     if when is not None:
-        KeyCondition.of(when, key_expression)
+        KeyCondition.of(when, key_expression)  # raises for a wrong condition
     with open_observer(connect, fleet, keyexpr) as client:
         warn_if_missing(key_expression, client.cars())
         reported = shown = 0
@@ -340,10 +341,10 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
     expressions = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
     with open_observer(connect, fleet, keyexpr or "") as client:
-        found = _alive(client, expressions, look_s)
+        found = _survey(client, expressions, look_s)
         if not found:
             what = f"under {expressions[0]}" if keyexpr else f"of {keys.describe_fleet(fleet)}"
-            raise click.ClickException(describe_missing(client, expressions[0], f"no key {what} is alive"))
+            raise click.ClickException(describe_missing(client, expressions[0], f"no key {what} is published now"))
     if as_json:
         for each in found:
             click.echo(json.dumps(_row(each)))
@@ -351,8 +352,8 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
         show_table(_KEY_COLUMNS, [_cells(each) for each in found])
 
 
-def _alive(client: Fleet, expressions: Sequence[str], look_s: float) -> list[KeyInfo]:
-    """Survey the keys for `look_s`."""
+def _survey(client: Fleet, expressions: Sequence[str], look_s: float) -> list[KeyInfo]:
+    """Look at the bus for `look_s`, and return the keys in use."""
 
     def subscribe(take: Callable[[Sample], None]) -> Callable[[], object]:
         subscribers = [client.bus.subscribe(each, take) for each in expressions]
@@ -377,27 +378,27 @@ def _alive(client: Fleet, expressions: Sequence[str], look_s: float) -> list[Key
     return survey.keys(silent, datetime.now(UTC))
 
 
-def _row(alive: KeyInfo) -> dict[str, Any]:
-    topic = alive.topic
+def _row(info: KeyInfo) -> dict[str, Any]:
+    topic = info.topic
     return {
-        "key": alive.key,
+        "key": info.key,
         "type": topic.message if topic else None,
         "about": topic.about if topic else None,
         "units": dict(topic.units) if topic else {},
-        "rate_hz": None if alive.rate_hz is None else round(alive.rate_hz, 2),
-        "age_s": None if alive.age_s is None else round(alive.age_s, 3),
-        "stale": alive.stale,
+        "rate_hz": None if info.rate_hz is None else round(info.rate_hz, 2),
+        "age_s": None if info.age_s is None else round(info.age_s, 3),
+        "stale": info.stale,
     }
 
 
-def _cells(alive: KeyInfo) -> dict[str, str]:
-    stale = " (stale)" if alive.stale else ""
+def _cells(info: KeyInfo) -> dict[str, str]:
+    stale = " (stale)" if info.stale else ""
     return {
-        "key": alive.key,
-        "type": alive.topic.message if alive.topic else "-",
-        "unit": ", ".join(alive.units) or "-",
-        "rate": "-" if alive.rate_hz is None else f"{alive.rate_hz:.1f} Hz",
-        "age": "-" if alive.age_s is None else f"{alive.age_s:.1f} s{stale}",
+        "key": info.key,
+        "type": info.topic.message if info.topic else "-",
+        "unit": ", ".join(info.units) or "-",
+        "rate": "-" if info.rate_hz is None else f"{info.rate_hz:.1f} Hz",
+        "age": "-" if info.age_s is None else f"{info.age_s:.1f} s{stale}",
     }
 
 
@@ -436,7 +437,7 @@ def wait(
     connect: str | None,
     fleet: str,
 ) -> None:
-    """Wait until CONDITION is true for KEY and print the reading. The latest reading counts unless it is stale.
+    """Wait until CONDITION is true for a reading of KEY, and print it. The latest one counts, too, unless it is stale.
 
     If KEY has a wildcard, one matching key is enough. CONDITION is written as for `fleet watch --when`. With --ready,
     wait for cars instead. A car is ready when its link is open and the state of its motors is known.
@@ -454,9 +455,9 @@ def wait(
         raise click.UsageError("give a KEY and one CONDITION in quotes, as: red/sensor/range 'range_m < 0.3'")
     keyexpr, condition = words
     key_expression = written_out(keyexpr, fleet)
-    KeyCondition.of(condition, key_expression)
+    KeyCondition.of(condition, key_expression)  # raises for a wrong condition
     if for_s is not None and timeout_s is not None and for_s >= timeout_s:
-        raise click.UsageError(f"--for {for_s:g} s cannot be over within --timeout {timeout_s:g} s: give more time")
+        raise click.UsageError(f"--for {for_s:g} s must be shorter than --timeout {timeout_s:g} s")
     with open_observer(connect, fleet, keyexpr) as client:
         warn_if_missing(key_expression, client.cars())
         try:

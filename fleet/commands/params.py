@@ -199,7 +199,7 @@ class Color(click.ParamType[tuple[int, int, int]]):
         except ValueError as error:
             self.fail(str(error), param, ctx)
 
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's signature
         """Return names of colors."""
         return [CompletionItem(name) for name in COLORS if name.startswith(incomplete)]
 
@@ -219,7 +219,7 @@ class SessionPath(click.ParamType[Path]):
                 self.fail(str(error), param, ctx)
             raise click.ClickException(str(error)) from None
 
-    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002 - click's signature
         """Return the names of sessions, or let the shell complete a path."""
         there = sorted(each.name for each in sessions_in(ctx.meta.get(_PLACE) or sessions_place()))
         names = ["latest", *reversed(there)]

@@ -129,7 +129,8 @@ def _describe(reading: Reading, people: Sequence[str], motors: CarClaim | None) 
     at = clock(since_s)
     lasting = timedelta(seconds=max(0, int(time.time() - since_s)))
     lines = [f"{decision.subject}: {decision.decided}, for {lasting} (since {at})", f"  because: {decision.why}"]
-    lines += [f"  motors: {motors.words}"] if motors is not None else []
+    if motors is not None:
+        lines.append(f"  motors: {motors.words}")
     lines += [f"  person: {each}" for each in people]
     lines += [f"  reading: {each}" for each in decision.readings]
     lines += [f"  would change if: {each}" for each in decision.would_change.split("; or ")]

@@ -41,10 +41,10 @@ class LinkCheck:
     words: str
 
 
-def check_link(car: FleetCar, served: Mapping[str, tuple[str, str, str]]) -> LinkCheck:
-    """Check a car's link within HOST_TIMEOUT_S. `served` has state, reason and URL of the links of running gateways."""
-    if car.name in served:
-        state, reason, url = served[car.name]
+def check_link(car: FleetCar, running_links: Mapping[str, tuple[str, str, str]]) -> LinkCheck:
+    """Check a car's link within HOST_TIMEOUT_S. `running_links`: state, reason and URL, by the car of each gateway."""
+    if car.name in running_links:
+        state, reason, url = running_links[car.name]
         if url and not _is_same(url, car.link):
             words = f"a running gateway of this name has another link: {url}"
             return LinkCheck(car.name, car.link, ok=False, words=words)

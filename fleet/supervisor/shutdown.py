@@ -12,7 +12,7 @@ from fleet.client.claims import (
     NOT_STOPPED,
     STOP_SENT,
     STOPPED,
-    is_bad_rest,
+    may_still_move,
     rest_words,
 )
 from fleet.supervisor.car_status import CarStatus
@@ -74,7 +74,7 @@ class GatewayShutdown:
     @property
     def not_stopped(self) -> list[str]:
         """The cars that may be moving."""
-        return sorted(car for car, words in self.results.items() if is_bad_rest(words))
+        return sorted(car for car, words in self.results.items() if may_still_move(words))
 
     def begin(self, process: ManagedProcess) -> None:
         """Shut down this gateway."""

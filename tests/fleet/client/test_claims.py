@@ -5,8 +5,8 @@ import pytest
 from fleet.client.car_state import LATE_MESSAGE_NS, GatewayStarts
 from fleet.client.claims import (
     CarClaim,
-    is_bad_rest,
     link_claim,
+    may_still_move,
     mode_claim,
     motors_claim,
     rest_words,
@@ -58,7 +58,7 @@ def test_without_a_gateway_nothing_is_claimed_but_what_was() -> None:
 def test_stopped_is_said_only_of_what_was_shown(claim: CarClaim, begins: str, bad: bool) -> None:
     words = rest_words(claim, "red")
     assert words.startswith(begins)
-    assert is_bad_rest(words) is bad
+    assert may_still_move(words) is bad
 
 
 def test_message_of_earlier_gateway_counts_only_if_it_runs() -> None:
