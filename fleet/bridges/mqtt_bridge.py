@@ -38,12 +38,12 @@ this silence."""
 _FAREWELL_TIMEOUT_S: Final = 1.0
 """Timeout for the broker's first answer when the bridge ends."""
 _END_TIMEOUT_S: Final = 5.0
-"""Timeout for removing everything at the end, of 256 cars at most."""
+"""Timeout for removing all announcements at the end. There may be 256 of them (MAX_ANNOUNCED_CARS)."""
 _FIRST_RETRY_S: Final = 0.5
 _LONGEST_RETRY_S: Final = 10.0
 _MAX_INCOMING: Final = 1024
-"""Maximum number of messages from the broker in the queue: the availability of earlier cars, and the starts of Home
-Assistant."""
+"""Maximum number of unread messages from the broker. They say which cars an earlier bridge left as available, and when
+Home Assistant has started."""
 _REFUSED: Final = frozenset({4, 5, 134, 135})
 """Codes with which a broker refuses the user or the password, in MQTT 3.1.1 and 5."""
 
@@ -78,11 +78,11 @@ class MqttBridge:
     `notify` is called with news for a person: the broker is reached, or it is away.
     """
 
-    def __init__(self, client: Fleet, broker: Broker, plan: HomeAssistant, notify: Callable[[str], object]) -> None:
+    def __init__(self, client: Fleet, broker: Broker, home: HomeAssistant, notify: Callable[[str], object]) -> None:
         self._inbox = Inbox.listening(client, _TOPICS)
         self._observer = FleetObserver()
         self._broker = broker
-        self._plan = plan
+        self._home = home
         self._notify = notify
 
     async def run(self) -> None:
@@ -121,21 +121,22 @@ class MqttBridge:
 
     async def _connect(self, ended: asyncio.Event) -> None:
         """Connect, and connect again whenever the connection breaks, until the end."""
-        failures, was_there = 0, None
+        failures = 0
+        connected: bool | None = None  # None before the first attempt
         while not ended.is_set():
             try:
                 async with self._client() as client:
-                    if was_there is not True:
+                    if connected is not True:
                         self._notify(f"Publishing to {self._broker.words} (Ctrl-C ends it)")
-                    was_there, failures = True, 0
+                    connected, failures = True, 0
                     await self._publish(client, ended)
             except aiomqtt.MqttError as error:
                 refused = isinstance(error, aiomqtt.MqttCodeError) and _code(error) in _REFUSED
-                if refused and was_there is None:
+                if refused and connected is None:
                     raise BrokerRefused(f"{self._broker.words} refuses the user or the password") from None
-                if was_there is not False:
-                    self._notify(f"The broker at {self._broker.words} is away ({error}); it is tried again.")
-                was_there, failures = False, failures + 1
+                if connected is not False:
+                    self._notify(f"The broker at {self._broker.words} is away ({error}). The bridge tries again.")
+                connected, failures = False, failures + 1
                 with suppress(TimeoutError):
                     await asyncio.wait_for(ended.wait(), backoff_s(failures, _FIRST_RETRY_S, _LONGEST_RETRY_S))
 
@@ -150,7 +151,7 @@ class MqttBridge:
             keepalive=_KEEPALIVE_S,
             max_queued_incoming_messages=_MAX_INCOMING,
             logger=_SILENT,
-            will=aiomqtt.Will(self._plan.bridge_availability, OFFLINE, qos=1, retain=True),
+            will=aiomqtt.Will(self._home.bridge_availability, OFFLINE, qos=1, retain=True),
         )
 
     async def _publish(self, client: aiomqtt.Client, ended: asyncio.Event) -> None:
@@ -165,30 +166,30 @@ class MqttBridge:
                 each.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         # If there are unread bytes when we close the connection, it is reset, which looks like a crash to the broker.
-        # So unsubscribe first. A broker that hangs does not answer. Later it will read these messages, or publish our
-        # last will.
+        # So unsubscribe first. A broker that hangs does not answer. Then do not wait for it (qos 0): later it reads the
+        # last messages, or publishes our last will.
         qos = 1
         try:
-            await client.unsubscribe([self._plan.availabilities, self._plan.birth], timeout=_FAREWELL_TIMEOUT_S)
+            await client.unsubscribe([self._home.availabilities, self._home.birth], timeout=_FAREWELL_TIMEOUT_S)
         except aiomqtt.MqttError:
             qos = 0
-        await _send(client, self._plan.end(), qos)
+        await _send(client, self._home.end(), qos)
 
     async def _tell(self, client: aiomqtt.Client) -> None:
-        await client.subscribe([(self._plan.availabilities, 1), (self._plan.birth, 1)])
-        await _send(client, self._plan.begin())
+        await client.subscribe([(self._home.availabilities, 1), (self._home.birth, 1)])
+        await _send(client, self._home.begin())
         while True:
-            await _send(client, self._plan.news(self._cars(), time.monotonic()))
+            await _send(client, self._home.news(self._cars(), time.monotonic()))
             await asyncio.sleep(_WAIT_S)
 
     async def _listen(self, client: aiomqtt.Client) -> None:
         async for message in client.messages:
             topic, payload = str(message.topic), message.payload
-            if topic == self._plan.birth:
+            if topic == self._home.birth:
                 if payload == b"online" and not message.retain:
-                    await _send(client, self._plan.begin())
+                    await _send(client, self._home.begin())
             elif isinstance(payload, bytes):
-                await _send(client, self._plan.adopt(topic, payload))
+                await _send(client, self._home.adopt(topic, payload))
 
     def _cars(self) -> dict[str, CarState]:
         """Return the confirmed cars, with the newest messages about them."""
@@ -200,7 +201,7 @@ class MqttBridge:
 
 
 async def _send(client: aiomqtt.Client, publications: Iterable[Publication], qos: int = 1) -> None:
-    # Compute all of them first, because the state of `_plan` may change while one is sent.
+    # Compute all of them first, because the state of `_home` may change while one is sent.
     for each in list(publications):
         await client.publish(each.topic, each.payload, qos=qos, retain=each.retain)
 

@@ -37,7 +37,7 @@ NEVER_HEARD: Final = "nothing was heard from it yet"
 _MAX_KNOWN_ENDED: Final = 8
 """Number of ended gateways of a car whose late messages are recognized."""
 LATE_MESSAGE_NS: Final = 2_000_000_000
-"""Maximum time from the stamp of the last message that counted to that of a late message of an ended gateway, ns."""
+"""A message of an ended gateway does not count, unless its stamp is newer than all others by more than this, ns."""
 _UNHEARD_S: Final = 3.0
 """Silence after which a car counts as unheard if the state of its motors is unknown."""
 

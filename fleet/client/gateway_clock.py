@@ -13,7 +13,7 @@ from collections import deque
 from typing import Final
 
 MAX_CLOCK_OFF_S: Final = 5.0
-"""Maximum difference of two clocks that is not reported. A gateway refuses a command from further in the future."""
+"""A larger difference of two clocks is reported. A gateway refuses a command that comes from further in the future."""
 _KEPT: Final = 8
 """Number of messages that are remembered: those of two seconds, as each of four states comes once a second."""
 _MIN_STAMPS: Final = 2

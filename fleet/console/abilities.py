@@ -21,7 +21,7 @@ class Abilities:
     """Missing capabilities, each with the reason."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return them as JSON values."""
+        """Return the abilities as JSON values."""
         return {"modes": self.modes, "lights": self.lights, "can": self.can, "cannot": dict(self.cannot)}
 
 

@@ -95,7 +95,7 @@ def plan_name(text: str, roles: Iterable[str]) -> str:
 
 
 def named(words: str, text: str) -> str:
-    """Return words of a coordinator about the plan of this text, with the name of the plan in place of its hash."""
+    """Replace the hash of a plan by its name in words of a coordinator. `text` is the text of the plan."""
     return words.replace(f"plan {version_of(text)}", f"plan “{plan_name(text, ())}”")
 
 

@@ -162,7 +162,7 @@ class NetworkGuard(Guard):
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
 
-    def _new_cookie(self, scope: Scope, headers: dict[str, str]) -> list[tuple[bytes, bytes]]:  # noqa: ARG002 - Guard's
+    def _new_cookie(self, scope: Scope, headers: dict[str, str]) -> list[tuple[bytes, bytes]]:  # noqa: ARG002 - Guard's signature
         return []  # only a pairing code leads to a cookie
 
 

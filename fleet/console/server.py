@@ -94,7 +94,7 @@ class NetworkServer(ConsoleServer):
         self._lan = lan
         self._entrance: Entrance | None = None
 
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:  # noqa: ARG002 - uvicorn's own
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:  # noqa: ARG002 - uvicorn's signature
         """Begin to accept. uvicorn itself would begin TLS with all waiting connections at once."""
         await super().startup(sockets=[])
 

@@ -145,7 +145,7 @@ class HubStore:
         """
         now = datetime.now(UTC) if now is None else now
         self.directory.mkdir(parents=True, exist_ok=True)
-        os.chmod(self.directory, 0o700)  # noqa: PTH101 - it has keys
+        os.chmod(self.directory, 0o700)  # noqa: PTH101 - a private directory
         if not self.is_hub and self.credentials.exist:
             raise BrokenHub(
                 f"{self.directory} has the certificate of the hub's authority, and not its key: this computer has "

@@ -121,7 +121,7 @@ def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) 
     credentials = Credentials.of(endpoint)
     directory = credentials.directory
     directory.mkdir(parents=True, exist_ok=True)
-    os.chmod(directory, 0o700)  # noqa: PTH101 - it has a key
+    os.chmod(directory, 0o700)  # noqa: PTH101 - a private directory
     name = HUB if joined.rules else joined.identity
     files = {CA_FILE: joined.ca, f"{name}.key": joined.key, f"{name}.pem": joined.certificate}
     if not joined.rules and (

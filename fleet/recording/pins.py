@@ -33,7 +33,7 @@ class Pin:
     cars: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the pin as JSON values."""
         times = {"from": iso(self.begin_ns), "to": iso(self.end_ns + _MS_NS - 1)}
         return {**times, "cause": self.cause, "words": self.words, "cars": list(self.cars)}
 

@@ -65,7 +65,7 @@ class ConditionRun:
         self._ahead_ns = 0
         self.hits: list[Hit] = []
         self.longest_s = -1.0
-        """The longest time for which the condition held, s; negative if it never did."""
+        """The longest time (s) for which the condition held. Negative if it never did."""
 
     def add(self, topic: str, message: Any, at_ns: int, ahead_ns: int = 0) -> None:
         """Use a message. `at_ns` is its stamp, `ahead_ns` how far the recorder's clock was ahead of that stamp, ns."""
@@ -102,7 +102,7 @@ class Found:
     hits: list[Hit]
     """Sorted by time."""
     longest_s: float
-    """The longest time for which the condition held, regardless of `for_s`, s; negative if it never did."""
+    """The longest time (s) for which the condition held, regardless of `for_s`. Negative if it never did."""
     left_out: LeftOut
     """Messages under the keys of the condition that contain none of its values."""
 

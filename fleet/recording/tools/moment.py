@@ -2,8 +2,8 @@
 
 The moment is by the recorder's clock, as `start_ns` and `end_ns` of `Session.messages`, because the clocks of gateways
 may be wrong and differ. A message that the recorder had not received by then is not known yet. Of the messages that it
-had received, the newest by the time of publishing counts, as in the tables, because a backfilled message comes late and
-is old.
+had received, the one that was published last counts, as in the tables: a backfilled message is received late, although
+it is old.
 """
 
 from collections.abc import Iterable, Iterator, Mapping

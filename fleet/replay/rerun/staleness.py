@@ -63,14 +63,17 @@ class StaleStates:
             before: _Run | None = None
             ends: list[_Run] = []
             for run in sorted(runs):
-                if before is None or run.first - before.last > stale_ns:
-                    ends += [before] if before is not None else []
+                if before is None:
+                    before = run
+                elif run.first - before.last > stale_ns:
+                    ends.append(before)
                     before = run
                 elif run.last > before.last:
                     before = run
             assert before is not None
             self._runs[path] = [before]
-            ends += [before] if now_ns - before.last > stale_ns else []
+            if now_ns - before.last > stale_ns:
+                ends.append(before)
             ends = [end for end in ends if end.last > self._ended_ns.get(path, 0)]
             if ends:
                 self._ended_ns[path] = ends[-1].last
