@@ -61,7 +61,7 @@ class CommandQueue:
 
     @property
     def held_until(self) -> float:
-        """Return when the held motion ends, by its duration or by the loss of its sender; inf if none is held."""
+        """Return when the held motion ends, by its duration or by the loss of its sender, or inf if none is held."""
         held = self.held
         return float("inf") if held is None else min(held.expires_at, self.senders.lost_at(held.sender.name))
 
@@ -108,7 +108,7 @@ class CommandQueue:
 
     @property
     def part_at(self) -> float:
-        """Return when the next frame of an action is due; inf if none waits."""
+        """Return when the next frame of an action is due, or inf if none waits."""
         return min((each.due_at for each in self.turns), default=float("inf"))
 
     @property

@@ -133,7 +133,7 @@ class Controller(Generic[D_co]):
         return self.driver.model.link_open and self.driver.accepts_commands(now)
 
     def wait_s(self, what: Action, now: float) -> float:
-        """Return the longest time that a drive or a mode would wait for its frame, as far as that is known, s."""
+        """Return the longest time until the frame of a drive or a mode could be written, as far as it is known, s."""
         busy_s = self._busy_s(now)
         return self.driver.mode_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
 
@@ -610,7 +610,7 @@ class Controller(Generic[D_co]):
             link_open=self.driver.model.link_open,
             link_reason=self.driver.model.link_reason,
             closing=self.driver.shutting_down,
-            asked=Mode.MANUAL if self.driver.model.mode.is_left and self._queue.mode_change is None else self.asked,
+            asked=Mode.MANUAL if self.driver.model.mode.is_over and self._queue.mode_change is None else self.asked,
             authority=self.authority_at(now),
             ended=self.safety.ended,
             battery=self.driver.model.battery.refusal,

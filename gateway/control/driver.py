@@ -46,7 +46,7 @@ STALL_S: Final = 0.5
 """Maximum gap of the loop during a held motion. After a longer one the gateway stops the car
 (docs/explanation/how-it-works.md#processes-and-threads)."""
 LATE_DRIVE_S: Final = 0.1
-"""Maximum delay of a drive's frame that is not reported to its sender."""
+"""If a drive begins later than this, its sender is told how long it waited."""
 MOVED_CM: Final = 5.0
 """Minimum change of the distance that counts as a movement. At rest, readings differ by up to a centimeter."""
 
@@ -88,7 +88,7 @@ class Rejected:
 class TextLine:
     """A whole line of text between frames, such as a debug print, with its line end. It does not count as damage.
 
-    `at` is the time of the last byte of the unreadable bytes in which it was found.
+    It may be in a longer run of unreadable bytes. `at` is the time of the last byte of that run.
     """
 
     raw: bytes
@@ -134,7 +134,7 @@ class ModeClaims(Protocol):
         """The modes in which the car could have sent the last reading."""
 
     @property
-    def is_left(self) -> bool:
+    def is_over(self) -> bool:
         """True if the readings show that the car is no longer in the commanded mode."""
 
 
@@ -178,11 +178,11 @@ class DriverClaims(Protocol):
 
     @property
     def known(self) -> bool:
-        """True if the car reads frames as they are meant: its first stop is over, and no write has failed since."""
+        """True after the first stop of the car, until a write fails. Then the car reads frames as they are meant."""
 
     @property
     def at_rest(self) -> bool:
-        """True if the car stands still in mode 0 after a stop, whatever the evidence for that is."""
+        """True if the car stands still in mode 0 after a stop. The basis may be `shown` or only `sent`."""
 
     @property
     def is_heard(self) -> bool:
@@ -242,7 +242,7 @@ class DriverClaims(Protocol):
         """
 
 
-def describe_way(before_cm: float | None, now_cm: float | None) -> str:
+def describe_distance_change(before_cm: float | None, now_cm: float | None) -> str:
     """Describe how the distance has changed during a drive. Empty if it shows no movement."""
     if before_cm is None or now_cm is None or abs(now_cm - before_cm) < MOVED_CM:
         return ""
@@ -310,7 +310,7 @@ class Driver(ABC):
         return []
 
     def flush_at(self) -> float:
-        """Return when `flush` has something to do if no byte arrives earlier; inf if never."""
+        """Return when `flush` has something to do if no byte arrives earlier, or inf if never."""
         return float("inf")
 
     @abstractmethod
@@ -383,13 +383,13 @@ class Driver(ABC):
 
     @abstractmethod
     def next_at(self, now: float) -> float:
-        """Return when `poll` may have something to do if nothing happens earlier; inf if never."""
+        """Return when `poll` may have something to do if nothing happens earlier, or inf if never."""
 
     # ------------------------------------------------------------------ commands
 
     @abstractmethod
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state, or None if it can."""
+        """Return why this car cannot do this at all, or None if it can."""
 
     @abstractmethod
     def frames(self, what: Action) -> tuple[Any, ...]:
@@ -416,12 +416,12 @@ class Driver(ABC):
         return ""
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return the longest time that a mode would wait for its frame, s. `busy_s` is the wait of a motion."""
+        """Return the longest time until the frame of a mode could be written, s. For a motion, it is `busy_s`."""
         del now
         return busy_s
 
     def opening_s(self, mode: Mode) -> float:
-        """Return how long it takes until a mode is open, s."""
+        """Return how long the car takes to open a mode, s."""
         del mode
         return 0.0
 
@@ -449,7 +449,10 @@ class Driver(ABC):
 
     @abstractmethod
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
-        """Stop the car by all means, for a command if there is one. Join a stop in progress that is as strong."""
+        """Stop the car, also if it is in a mode. Join a stop in progress that is as strong.
+
+        `pending` is the command that asked for the stop, if any.
+        """
 
     @abstractmethod
     def end_motion(self, now: float, pending: Pending | None = None) -> None:
@@ -541,7 +544,7 @@ class Driver(ABC):
         """End the commands whose time is over."""
         held, car = self.queue.held, self.desk.car
         if held is not None and now >= self.queue.held_until:
-            if now < held.expires_at:
+            if now < held.expires_at:  # it has time left, but its sender is gone
                 self.safety.mark_holder(held.sender.name, connected=False)
                 self.release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.text_name} disconnected", now)
             elif held.pending.sent:
@@ -550,7 +553,7 @@ class Driver(ABC):
                     waited_s = held.began_at - held.pending.received_at
                     words = f"began after {waited_s:.1f} s: {car} was busy"
                 self.release(Phase.COMPLETE, None, words, now)
-            else:
+            else:  # its frame could not be written in all that time
                 waited_s = now - held.pending.received_at
                 self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy for {waited_s:.1f} s", now)
         self.queue.expire(now)

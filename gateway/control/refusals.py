@@ -55,7 +55,7 @@ class CommandContext:
     """Why the battery allows no new drive. Empty if it allows one."""
     queued: int
     unsupported: str | None = None
-    """Why this car cannot do it in any state, as its driver says, or None if it can."""
+    """Why this car cannot do this at all, as its driver says, or None if it can."""
     loan_until: float = 0.0
     """When the loan ends, s, monotonic."""
     slept_at: float = float("-inf")

@@ -36,7 +36,7 @@ class Senders:
             self._tokens.pop(name, None)
 
     def lost_at(self, name: str) -> float:
-        """Return when the sender counts as lost; inf if its token exists, or never did."""
+        """Return when the sender counts as lost, or inf if its token exists, or never did."""
         # The bus may deliver the first drive before the token.
         gone_at = self._tokens.get(name)
         return float("inf") if gone_at is None else gone_at + SENDER_GONE_S

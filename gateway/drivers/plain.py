@@ -32,7 +32,7 @@ from gateway.control.driver import (
     Outputs,
     Rejected,
     TextLine,
-    describe_way,
+    describe_distance_change,
     learn_trust,
     log_unstopped,
 )
@@ -76,7 +76,7 @@ class PlainMode:
     evidence_at: float | None = None
     since: float | None = None
     candidates: tuple[Mode, ...] = ()
-    is_left: bool = False
+    is_over: bool = False
 
 
 @dataclass(slots=True)
@@ -156,7 +156,7 @@ class PlainModel:
         """Describe the reading since `since` that shows that a drive moved the car. Empty if none does."""
         if self.turned_at > since:
             return "its wheels turned"
-        return "" if self.range_at < since else describe_way(range_cm, self.range_cm)
+        return "" if self.range_at < since else describe_distance_change(range_cm, self.range_cm)
 
 
 # ---------------------------------------------------------------------- the driver
@@ -175,7 +175,7 @@ class PlainStop:
     index: int = 0
     """Number of this try's frames that are written."""
     last_at: float = float("-inf")
-    """When the first try's last frame was written; -inf before."""
+    """When the first try's last frame was written, or -inf before."""
     is_late: bool = False
     """True if the car did not show the stop in time. The driver continues to send it."""
 
@@ -246,7 +246,7 @@ class PlainDriver(Driver):
         return None
 
     def setup_at(self) -> float:
-        """Return when `setup_frame` may have something to do; inf if never."""
+        """Return when `setup_frame` may have something to do, or inf if never."""
         return float("inf")
 
     def on_reading(self, event: Event, now: float) -> None:
@@ -456,7 +456,7 @@ class PlainDriver(Driver):
         self.on_stop_written(data, now)
 
     def next_at(self, now: float) -> float:
-        """Return when `poll` may have something to do if nothing happens earlier; inf if never."""
+        """Return when `poll` may have something to do if nothing happens earlier, or inf if never."""
         if not self._model.link_open:
             return float("inf")
         times = [*self.queue.deadlines(), self.setup_at()]
@@ -482,7 +482,7 @@ class PlainDriver(Driver):
     # ------------------------------------------------------------------ commands
 
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state, or None if it can."""
+        """Return why this car cannot do this at all, or None if it can."""
         car, model = self.desk.car, self._model
         match what:
             case SetMode(mode) if mode not in model.profile.modes:
@@ -559,7 +559,7 @@ class PlainDriver(Driver):
         return self._not_stopped
 
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
-        """Stop the car by all means."""
+        """Stop the car, also if it is in a mode."""
         self._begin(why, now, [pending] if pending is not None else [], is_soft=False)
 
     def end_motion(self, now: float, pending: Pending | None = None) -> None:

@@ -351,7 +351,7 @@ class BleLink(BufferedLink):
 
 
 class BleKind(LinkKind[BleUrl]):
-    """Bluetooth LE."""
+    """Opens Bluetooth LE links, and lists devices."""
 
     # A module advertises about once a second, and a scan often misses the first advertisement. The fourth car needs 4 s
     # to connect.

@@ -338,7 +338,7 @@ class SerialLink(Link):
 class SerialKind(LinkKind[SerialUrl | UsbUrl]):
     """Serial ports, by path or by USB device."""
 
-    async def open(self, url: SerialUrl | UsbUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no turns
+    async def open(self, url: SerialUrl | UsbUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no car waits
         """Open a serial port. Each call searches for a USB device again. Raises CannotOpen if it does not open."""
         if str(url) in _opening:  # another attempt would leave another hanging thread
             raise CannotOpen(f"{url}: an earlier attempt to open the port still hangs: unplug it, and plug it in again")
@@ -384,7 +384,7 @@ def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
         return f"{which}in use by {_find_holder(path)}. Stop that program first."
     if code == errno.EISDIR or os.path.isdir(path):  # noqa: PTH112 - a device path, not a file to work with
         return f"{which}this is a directory, not a serial port. {_list_ports_text()}"
-    if not isinstance(error, ValueError) and os.path.exists(path):  # noqa: PTH110 - likewise
+    if not isinstance(error, ValueError) and os.path.exists(path):  # noqa: PTH110 - a device path
         return f"{which}this is not a serial port ({_cause(error)}). {_list_ports_text()}"
     return f"{which}the port cannot be opened ({_cause(error)}). {_list_ports_text()}"
 

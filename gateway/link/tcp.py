@@ -19,10 +19,10 @@ from schemas.links import TcpUrl
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 
 SAID_WITHIN_S: Final = 3.0
-"""Time within which a bridge that already has a client sends a text about that, and closes the connection. If a
-connection lasts longer, its bytes are those of a car."""
+"""Time within which a bridge that already has a client closes a new connection. It may send a text before that, which
+says why. If a connection lasts longer, all its bytes come from a car."""
 MAX_SAID_BYTES: Final = 120
-"""Maximum bytes of the text of a bridge that an error message quotes."""
+"""Maximum length of the quote from a bridge in an error message, bytes."""
 
 _Addresses = list[tuple[int, Any]]
 """(family, socket address), as from getaddrinfo."""
@@ -115,8 +115,9 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         why = "the car closed it" if exc is None else _cause(exc)
         # A car serves one client and rejects the next. A bridge, such as ser2net, often says why before it closes.
         is_early = time.monotonic() - self._made_at < SAID_WITHIN_S
-        said = _sentence(self._first) if is_early else ""
-        if (said or not self._first) and (exc is None or isinstance(exc, ConnectionResetError)):
+        said = _bridge_text(self._first) if is_early else ""
+        peer_closed = exc is None or isinstance(exc, ConnectionResetError)
+        if peer_closed and (said or not self._first):
             why += f', and said "{said}".' if said else " before it sent anything."
             why += " Perhaps another gateway or program is connected to it."
         self._lost = self._lost or f"{self._url} is gone: {why}"
@@ -124,7 +125,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         self._ended.set()
 
 
-def _sentence(data: bytes) -> str:
+def _bridge_text(data: bytes) -> str:
     """Return what a bridge said before it closed, with control characters escaped. Empty for a car's bytes."""
     text = data.decode(errors="replace").strip()
     printed = sum(each.isprintable() and each != "\ufffd" for each in text)
@@ -135,9 +136,9 @@ def _sentence(data: bytes) -> str:
 
 
 class TcpKind(LinkKind[TcpUrl]):
-    """TCP."""
+    """Opens TCP links."""
 
-    async def open(self, url: TcpUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no turns
+    async def open(self, url: TcpUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no car waits
         """Connect. Raises CannotOpen if nobody answers."""
         try:
             async with asyncio.timeout(timeout_s):
@@ -162,7 +163,7 @@ KIND: Final = TcpKind()
 async def _look_up(url: TcpUrl) -> _Addresses:
     """Return the addresses of the host. Raises the errors of getaddrinfo."""
     # If the name server is silent, getaddrinfo blocks for a minute and cannot be cancelled. So run it in a daemon
-    # thread: the process would wait for the loop's own threads before it ends. All attempts share one lookup.
+    # thread. (Before the process ends, it would wait for a thread of the loop.) All attempts share one lookup.
     found = _lookups.get(url)
     if found is None or found.done():
         found = Future()
@@ -183,7 +184,7 @@ def _resolve(url: TcpUrl, found: "Future[_Addresses]") -> None:
 
 async def connect_first(url: TcpUrl, addresses: Iterable[tuple[int, Any]]) -> Link:
     """Connect to the first (family, socket address) that accepts. If none does, raise the first OSError."""
-    # `create_connection` with a name would hide the error numbers of several addresses in one text.
+    # `create_connection` could try all addresses of a name. But if several fail, its error has no number, only a text.
     loop = asyncio.get_running_loop()
     first: OSError | None = None
     for family, address in addresses:

@@ -435,7 +435,7 @@ class WaveshareDriver(PlainDriver):
             self._stop.next_at = max(self._stop.next_at, self._setup_at)
 
     def stop(self, why: FrameOrigin, now: float, pending: Any = None) -> None:
-        """Stop the car by all means. A stop that somebody asked for does not wait for the end of a boot."""
+        """Stop the car, also if it is in a mode. A stop that somebody asked for does not wait for the end of a boot."""
         super().stop(why, now, pending)
         if self._stop is not None and self._stop.index == 0:
             self._stop.next_at = now
@@ -507,7 +507,7 @@ class WaveshareDriver(PlainDriver):
     # ------------------------------------------------------------------ frames out
 
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state, or None if it can."""
+        """Return why this car cannot do this at all, or None if it can."""
         if isinstance(what, Drive) and self._firmware is not None and self._here is None:
             name = self._model.profile.name
             return f"{self.desk.car} runs {self._firmware}, which {name} cars do not have. Correct `platform:`."

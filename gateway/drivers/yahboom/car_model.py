@@ -8,7 +8,7 @@ from typing import Any
 
 from gateway.control.battery import Battery, BatteryPolicy
 from gateway.control.command_log import CommandLog
-from gateway.control.driver import Findings, Outputs, describe_way, learn_trust
+from gateway.control.driver import Findings, Outputs, describe_distance_change, learn_trust
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.estimate.mode import ModeEstimator
@@ -220,7 +220,7 @@ class CarModel:
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
         """Describe how the distance has changed since a drive began. Empty if no reading shows a change."""
-        return "" if self.range_at < since + FLIGHT_S else describe_way(range_cm, self.range_cm)
+        return "" if self.range_at < since + FLIGHT_S else describe_distance_change(range_cm, self.range_cm)
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:

@@ -112,7 +112,7 @@ class CarMonitor:
         model.learned.on_fields(event, model.profile.rejects(event))
         if event.at > model.mode_closed_at + FLIGHT_S:
             model.mode_left_by = float("-inf")
-            if model.trust.state is not CarTrust.IN_MODE or model.mode.is_left:
+            if model.trust.state is not CarTrust.IN_MODE or model.mode.is_over:
                 model.learned.opened_as = ""
         if event.range_cm is not None:
             model.pacing.on_report(event.at)

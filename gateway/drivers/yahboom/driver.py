@@ -66,7 +66,7 @@ class YahboomDriver(Executor):
         return [*self._decoder.tick(now)]
 
     def flush_at(self) -> float:
-        """Return when `flush` has something to do if no byte arrives earlier; inf if never."""
+        """Return when `flush` has something to do if no byte arrives earlier, or inf if never."""
         deadline = self._decoder.deadline()
         return float("inf") if deadline is None else deadline
 
@@ -128,7 +128,7 @@ class YahboomDriver(Executor):
     # ------------------------------------------------------------------ commands
 
     def refusal(self, what: Action) -> str | None:
-        """Return why this car cannot do it in any state, or None if it can."""
+        """Return why this car cannot do this at all, or None if it can."""
         car, profile, believed = self.desk.car, self.model.profile, self.model.believed
         match what:
             case SetMode(mode) if mode is not Mode.MANUAL and mode not in profile.modes:
@@ -205,7 +205,7 @@ class YahboomDriver(Executor):
         return whistle, other, whistle, led
 
     def opening_s(self, mode: Mode) -> float:
-        """Return how long it takes until a mode is open, s."""
+        """Return how long the car takes to open a mode, s."""
         return self.model.profile.block_s(ModeOpen(mode))
 
     def end_doubt(self, now: float) -> None:

@@ -184,7 +184,7 @@ class Executor(Driver):
         return self._prepare(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return the longest time that a mode would wait for its frame, s. `busy_s` is the wait of a motion."""
+        """Return the longest time until the frame of a mode could be written, s. For a motion, it is `busy_s`."""
         model = self.model
         if model.rest_is_sure and self.stops.running is None:
             return max(busy_s, model.pacing.open_at(now, can_show=model.can_show) - now)
@@ -206,7 +206,8 @@ class Executor(Driver):
         """Return True if a command waits that may go before the repeats of the running stop."""
         held, change = self.queue.held, self.queue.mode_change
         waiting = [self._next_mode] if self._actions_wait(now) else [change, self.queue.next_part(now)]
-        waiting += [held.pending] if held is not None and not held.pending.sent else []
+        if held is not None and not held.pending.sent:
+            waiting.append(held.pending)
         return any(pending is not None and self._may_overtake(pending) for pending in waiting)
 
     def _actions_wait(self, now: float) -> bool:
@@ -262,8 +263,8 @@ class Executor(Driver):
         running = self.stops.running
         if running is None or not self._full_stop_runs:
             return True
-        # A stop that is sent before a mode is for that mode, and for the commands that were queued before it. If a
-        # newer mode may go before the repeats of a stop, the commands for which it waits may too.
+        # A mode waits for the commands that were queued before it. So if a mode may go before the rest of the stop,
+        # these commands may, too. That is so for the mode for which the stop is sent, and for a mode that is newer.
         change = self.queue.mode_change
         newer = change if change is not None and change.received_at >= running.began_at else None
         modes = (running.mode_command, newer)
@@ -373,7 +374,7 @@ class Executor(Driver):
                     model.evidence.on_other_frame()
                 if shown and frame != model.believed.with_fan(STOP_FRAME) and model.trust.shown:
                     self._doubt_rest(now)
-        if model.stop_style is StopStyle.GENERAL and (model.mode.asked is None or model.mode.is_left):
+        if model.stop_style is StopStyle.GENERAL and (model.mode.asked is None or model.mode.is_over):
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:
@@ -415,7 +416,7 @@ class Executor(Driver):
         return self.stops.not_stopped
 
     def stop(self, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
-        """Stop the car by all means."""
+        """Stop the car, also if it is in a mode."""
         self.stops.begin(self.stops.full(now), why, now, pending)
 
     def end_motion(self, now: float, pending: Pending | None = None) -> None:
@@ -452,7 +453,7 @@ class Executor(Driver):
     # ------------------------------------------------------------------ time
 
     def next_at(self, now: float) -> float:
-        """Return when `poll` may have something to do if nothing happens earlier; inf if never."""
+        """Return when `poll` may have something to do if nothing happens earlier, or inf if never."""
         if not self.model.link_open:
             return float("inf")
         times = self.queue.deadlines()

@@ -122,7 +122,7 @@ class Pacing:
 
     @property
     def awake_until(self) -> float:
-        """Return until when the car reads a frame at once, as its last report shows; -inf if nothing shows it."""
+        """Return until when the car reads a frame at once, as its last report shows, or -inf if nothing shows it."""
         if not (self.learned.echo.is_known or self.learned.no_echo.is_known):
             return float("-inf")  # the car may range again at once
         return self._reported_at + min(AWAKE_S, max(0.0, self._interval_s - LINK_DELAY_S))
@@ -133,7 +133,7 @@ class Pacing:
 
     @property
     def written_at(self) -> float:
-        """Return when the last frame was written; -inf if none was."""
+        """Return when the last frame was written, or -inf if none was."""
         return self._written_at
 
     @property

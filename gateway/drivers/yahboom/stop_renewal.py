@@ -50,7 +50,7 @@ class StopRenewal:
 
     @property
     def due_at(self) -> float:
-        """Return when the next frame of a renewal is due; inf if never."""
+        """Return when the next frame of a renewal is due, or inf if never."""
         if self._general_stop_follows:
             return self._model.pacing.written_at + REPEAT_INTERVAL_S
         # `MODE00` must not reach the car together with a servo frame before it. The car would read both as one string,
@@ -59,7 +59,7 @@ class StopRenewal:
 
     @property
     def goes_first_at(self) -> float:
-        """Return when the next frame of a renewal goes before a stream of actions; inf if never."""
+        """Return when the next frame of a renewal goes before a stream of actions, or inf if never."""
         follows_at = self._cleared_at + REPEAT_INTERVAL_S
         return (follows_at if self._general_stop_follows else self._next_at) + HELD_UP_S
 

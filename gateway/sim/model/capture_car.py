@@ -57,7 +57,7 @@ class CaptureCar:
         return sent
 
     def next_event(self) -> float:
-        """Return the time of the next piece; inf if there is none, or if no host has connected yet."""
+        """Return the time of the next piece, or inf if there is none, or if no host has connected yet."""
         if self._start is None or self.done:
             return inf
         return self._start + self._pieces[self._index][0] / self._rate

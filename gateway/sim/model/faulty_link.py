@@ -205,7 +205,7 @@ class FaultyLink:
         return {way: lane.lost_bytes for way, lane in self._lanes.items()}
 
     def next_event(self) -> float:
-        """Return the time of the next delivery; inf if there is none."""
+        """Return the time of the next delivery, or inf if there is none."""
         due = min((lane.pieces[0][0] for lane in self._lanes.values() if lane.pieces), default=inf)
         if self._flood_at < self._flood_until:
             due = min(due, self._flood_at + max(FLOOD_INTERVAL_S, 1 / self._flood_rate))

@@ -165,7 +165,7 @@ class Firmware:
         self.scheduler: EventScheduler | None = None
         """Runs the programs of all cars in the order of time. None if cars do not affect each other."""
         self._alarm_at = inf
-        """Time of the next interrupt by a hardware timer; inf without a timer."""
+        """Time of the next interrupt by a hardware timer, or inf without a timer."""
         self._program = self._main()
         self._wait = Wait(now)
 
@@ -191,7 +191,7 @@ class Firmware:
         return sent
 
     def next_event(self) -> float:
-        """Return the time of the next event; inf if there is none."""
+        """Return the time of the next event, or inf if there is none."""
         due = self.due()
         return min(due, self._outgoing[0][0]) if self._outgoing else due
 
@@ -278,7 +278,7 @@ class Firmware:
     # The engine.
 
     def due(self) -> float:
-        """Return the time at which the program next runs; inf if it never does."""
+        """Return the time at which the program next runs, or inf if it never does."""
         if not self._alive:
             return inf
         until = min(self._wait.until, self._alarm_at)

@@ -47,7 +47,7 @@ class Lamp:
 
     @property
     def seen_from_m(self) -> float:
-        """The current range; 0 if the lamp is off."""
+        """The current range, or 0 if the lamp is off."""
         return self.reach_m * sqrt(self.brightness) if self.on else 0.0
 
 
@@ -99,7 +99,7 @@ class MovingObject:
         return Pose(x1 + share * (x2 - x1), y1 + share * (y2 - y1), self.heading_rad)
 
     def along_m(self, at_s: float) -> float:
-        """Return the position along the path; 0 without a path."""
+        """Return the position along the path, or 0 without a path."""
         if not self.path:
             return 0.0
         length = _ends(self.path)[-1]

@@ -76,7 +76,7 @@ class ModeEstimator:
         return self.asked if self.verdict is Verdict.CONFIRMED else None
 
     @property
-    def is_left(self) -> bool:
+    def is_over(self) -> bool:
         """Return True if readings show mode 0 although another mode was commanded, so the car has left that mode."""
         return self.asked is not Mode.MANUAL and self.verdict is Verdict.CONTRADICTED and self.inferred is Mode.MANUAL
 
@@ -185,7 +185,7 @@ class ModeEstimator:
 
     @property
     def heard_at(self) -> float:
-        """Return when the last reading arrived; -inf if none has."""
+        """Return when the last reading arrived, or -inf if none has."""
         return self._heard_at
 
     @property

@@ -220,7 +220,7 @@ class StopInProgress:
 
     @property
     def gives_way_at(self) -> float:
-        """Return when a new command may replace the repeats; inf if the first frames are not all written.
+        """Return when a new command may replace the repeats, or inf if the first frames are not all written.
 
         A single command does not wait for evidence. It waits for the first frames, until the announced worst case is
         over, or until a report shows that the car is in mode 0 and reads frames.

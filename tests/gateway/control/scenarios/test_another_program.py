@@ -255,7 +255,7 @@ def swapped(told: str, mode: Mode) -> Pair:
 @pytest.mark.parametrize("told", ["auto", "arduino"])
 def test_a_program_that_changes_in_a_silent_mode_is_drivable(told: str) -> None:
     pair = swapped(told, Mode.COLOR_LED)
-    pair.until(lambda: pair.control.driver.model.mode.is_left, 15.0)
+    pair.until(lambda: pair.control.driver.model.mode.is_over, 15.0)
     answer = pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")
     assert answer.status != "rejected", answer
     pair.run(15.0)
