@@ -76,7 +76,7 @@ def distance(x: float, y: float, segment: Segment) -> float:
 
 
 def apart(a: Segment, b: Segment) -> float:
-    """Return the distance between two segments; 0 if they cross."""
+    """Return the distance between two segments, or 0 if they cross."""
     if _cross(a, b):
         return 0.0
     ends = (distance(*a[:2], b), distance(*a[2:], b), distance(*b[:2], a), distance(*b[2:], a))

@@ -10,7 +10,7 @@ from schemas.words import Level, Reason
 
 REASONS: Final[dict[str, str]] = {
     Reason.BAD_VALUE: "The request has a wrong value.",
-    Reason.UNSUPPORTED: "This car cannot do it in any state.",
+    Reason.UNSUPPORTED: "This car cannot do this at all.",
     Reason.WRONG_MODE: "The car ignores this command in its mode.",
     Reason.LEASED: "Another sender drives the car.",
     Reason.LENT: "The car is lent to another person.",

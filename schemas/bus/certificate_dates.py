@@ -26,7 +26,7 @@ class CertificateDates:
 
     @classmethod
     def of(cls, certificate: bytes) -> Self | None:
-        """Return the dates of a certificate, PEM, or None if it is not one."""
+        """Return the dates of a certificate in PEM. None if the bytes are not a certificate."""
         try:
             der = binascii.a2b_base64(found[1]) if (found := _PEM.search(certificate)) else b""
             dates = _VALIDITY.search(der)

@@ -144,7 +144,7 @@ def _begin_again(watch: PanicWatch) -> None:
     watch.restore()
     sys.stderr.write("hub: Zenoh's router has failed, so the hub restarts\n")
     sys.stderr.flush()
-    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - itself
+    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606 - this same program
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ def _is_device(descriptor: str, device: int) -> bool:
     try:
         if not os.readlink(descriptor).startswith("/dev/"):  # noqa: PTH115 - a path as text is enough
             return False
-        found = os.stat(descriptor)  # noqa: PTH116 - likewise
+        found = os.stat(descriptor)  # noqa: PTH116 - a descriptor
     except OSError:
         return False
     return stat.S_ISCHR(found.st_mode) and found.st_rdev == device

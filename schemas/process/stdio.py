@@ -18,7 +18,7 @@ def complete() -> None:
     if sys.__stdout__ is None:
         sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115 - a descriptor, for as long as the process
     if sys.__stderr__ is None:
-        sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115 - likewise
+        sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115 - stays open
 
 
 def silence(stream: IO[str]) -> None:

@@ -90,7 +90,7 @@ class SleepWatch:
             self._slept_s = best.at_most
 
     def take(self) -> float:
-        """Return how long the computer has slept since the last call, s; 0 if it has not."""
+        """Return how long the computer has slept since the last call (s), or 0 if it has not."""
         if self._clocks is None:
             return 0.0
         found = self._read(self._clocks)

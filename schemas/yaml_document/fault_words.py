@@ -1,6 +1,7 @@
 """Puts pydantic's errors into words for a person. Pure.
 
-The allowed values come from the model's JSON schema, which has all members of a union. document.py adds the place.
+An error of pydantic is about one member of a union only, so the allowed values come from the model's JSON schema, which
+has all of them. document.py adds the place.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -43,7 +44,8 @@ def format_place(where: Where, tree: object = None) -> str:
         if isinstance(part, int):
             plural = words.pop() if words else "numbers"
             name = tree.get("name") if isinstance(tree, dict) else None
-            segments += [".".join(words)] if words else []
+            if words:
+                segments.append(".".join(words))
             item = name if isinstance(name, str) and name.isprintable() and name else part + 1
             segments.append(f"{_ITEMS.get(plural, plural.removesuffix('s'))} {item}")
             words = []
@@ -57,7 +59,8 @@ def suggest(word: str, allowed: Iterable[str]) -> str:
     words = list(allowed)
     if near := did_you_mean(word, words):
         return near
-    return f"There {'are' if len(words) > 1 else 'is only' if words else 'is'} {list_words(words)}."
+    verb = "are" if len(words) > 1 else "is only" if words else "is"
+    return f"There {verb} {list_words(words)}."
 
 
 def list_words(words: Collection[str]) -> str:
@@ -77,7 +80,10 @@ def quote_value(value: object) -> str:
 
 
 def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str, Any]) -> tuple[str, str]:
-    """Return what is wrong, and how to mend it (may be empty), for an error of pydantic of this kind."""
+    """Return two texts about one of pydantic's errors: what is wrong, and how to mend it. The second may be empty.
+
+    `kind` is pydantic's type of the error, such as `missing`. `where` is the place, and `schema` that of the model.
+    """
     definitions = schema.get("$defs", {})
     if kind == "extra_forbidden":
         allowed = sorted(
@@ -95,6 +101,7 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
     if kind in ("value_error", "assertion_error"):
         return str(error["ctx"]["error"]), ""
     fault = "has no value" if value is None else f"{quote_value(value)} is not allowed"
+    # If only some members of a union are words, the general case below describes all members.
     has_words = ["enum" in each or "const" in each for each in here]
     if kind in ("enum", "literal_error") and (all(has_words) or not any(has_words)):
         words = [str(word) for each in here for word in each.get("enum", [each["const"]] if "const" in each else [])]
@@ -111,8 +118,8 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
         if isinstance(value, str) and (near := did_you_mean(value, words)):
             return fault, near
         if kind.endswith("_type") and isinstance(value, bool | int | float):
-            # A number is not text unless it has quotes. Say so in the errors of all members of a union, so that
-            # document.py can merge them.
+            # A number is not text unless it has quotes. Each member of a union has an error about this value, and all
+            # get the same words, so that document.py prints them only once.
             allowed_here = ["text in quotes" if each == "text" else each for each in allowed_here]
         return fault, f"Write {' or '.join(dict.fromkeys(allowed_here))}."
     message = str(error["msg"])
