@@ -16,15 +16,14 @@ from schemas import topics
 from schemas.words import UNKNOWN, Basis, Motors
 
 STOPPED: Final = "stopped"
-"""First words of a stop that the car's own readings show."""
+"""How the text about a stop begins if the car's own readings show the stop."""
 STOP_SENT: Final = "stop sent"
-"""First words of a stop of a car that cannot show it."""
+"""How the text about a stop begins if the car cannot show a stop."""
 NOT_CONFIRMED: Final = "NOT CONFIRMED"
-"""First words of a stop that the car's readings could have shown, but did not."""
+"""How the text about a stop begins if the car's readings could have shown the stop, but did not."""
 NOT_STOPPED: Final = "NOT STOPPED"
-"""First words of a stop that did not reach a car that may be moving."""
+"""How the text about a stop begins if the stop did not reach the car, which may be moving."""
 NO_GATEWAY: Final = "no gateway"
-_STATES: Final = ("state/safety", "state/mode", "state/link")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,16 +46,16 @@ class CarClaim:
     """True if the gateway should have published it again meanwhile."""
 
     @property
-    def basic(self) -> str:
+    def with_basis(self) -> str:
         """The claim with its basis."""
         return f"{self.what} ({self.basis})" if self.basis else self.what
 
     @property
     def short(self) -> str:
         """The claim with its basis and, if it is old, its age: one cell of a table."""
-        old = f", {describe_age(self.age_s)} old" if self.is_stale and self.age_s is not None else ""
-        basis = f" ({self.basis}{old})" if self.basis else f" ({old.removeprefix(', ')})" if old else ""
-        return f"{self.what}{basis}"
+        old = f"{describe_age(self.age_s)} old" if self.is_stale and self.age_s is not None else ""
+        details = ", ".join(filter(None, (self.basis, old)))
+        return f"{self.what} ({details})" if details else self.what
 
     @property
     def words(self) -> str:
@@ -125,7 +124,7 @@ def describe_age(age_s: float) -> str:
 
 
 def _claim(topic: str, age_s: float, what: str, basis: str, since_s: float | None, why: str) -> CarClaim:
-    """Return a claim from a message of this age. `since_s` is what the message says."""
+    """Return a claim from a message of this age. When it was sent, the claim had been true for `since_s`."""
     after_s = topics.TOPICS[topic].stale_after_s
     is_stale = after_s is not None and age_s > after_s
     if isinf(age_s):  # its stamp gives no age
@@ -156,11 +155,14 @@ def claims_of(
 ) -> CarClaims:
     """Return the claims about a car. `states` are the newest messages by topic, with their ages."""
     ages = ages_s or {}
-    safety, mode, link = ((states.get(topic), ages.get(topic, 0.0)) for topic in _STATES)
+
+    def message_and_age(topic: str) -> tuple[Any, float]:
+        return states.get(topic), ages.get(topic, 0.0)
+
     return CarClaims(
-        motors_claim(*safety, present=present),
-        mode_claim(*mode, present=present),
-        link_claim(*link, present=present),
+        motors_claim(*message_and_age("state/safety"), present=present),
+        mode_claim(*message_and_age("state/mode"), present=present),
+        link_claim(*message_and_age("state/link"), present=present),
     )
 
 

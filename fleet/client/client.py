@@ -62,7 +62,7 @@ _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
 """Poll interval of a wait without a timeout."""
 _MAX_STOP_THREADS: Final = 1024
-"""Maximum number of a stop's queries that wait for answers at the same time. A stop has two queries."""
+"""Maximum number of queries of stops that wait at the same time, each on a thread. A stop of all cars has two."""
 _MIN_QUERY_TIMEOUT_S: Final = 0.1
 """Minimum timeout of the query for the current values, even if the wait itself is shorter."""
 
@@ -84,7 +84,10 @@ def default_sender(person: str | None = None) -> str:
 
 
 def certified_sender(identity: str, sender: str | None = None, person: str | None = None) -> str:
-    """Return the sender. Raises keys.BadKey if a person's certificate has another name than the one asked for."""
+    """Return the full name under which a client sends commands: `sender`, or else the default one.
+
+    `identity` is the owner of the client's certificate. If it is a person, raises keys.BadKey for another person.
+    """
     known = parse_identity(identity)
     if known is None or known[0] is not IdentityRole.PERSON:
         return sender or default_sender(person)
@@ -127,7 +130,7 @@ class Fleet:
     ) -> None:
         self.name = keys.check_name(name, "fleet name")
         self.kind = kind
-        keys.operator_token(self.name, sender or default_sender(person))
+        keys.operator_token(self.name, sender or default_sender(person))  # raises BadKey before the bus is opened
         try:
             self.bus = Bus.open(endpoint, start_hub=start_hub, identity=identity)
         except NoFleet as error:
@@ -269,7 +272,7 @@ class Fleet:
         def left_s() -> float:
             return _NO_TIMEOUT_POLL_S if timeout_s is None else began + timeout_s - time.monotonic()
 
-        with self.watch(expression) as stream:  # before the query of the current values: none is missed
+        with self.watch(expression) as stream:  # before the query, so that no value in between is missed
             for reading in self._read(key_expression, max(_MIN_QUERY_TIMEOUT_S, min(ANSWER_TIMEOUT_S, left_s()))):
                 if waiting.ends(reading, datetime.now(UTC)):
                     return reading
@@ -306,7 +309,8 @@ class Fleet:
         if not may_locate(self.bus.identity, check_car(car)):
             raise BusError(
                 f"{self.bus.identity} may not say where {car} is, so the hub would drop it. Open the fleet with "
-                'identity="service.locator"; on another computer, `fleet hub invite --service locator` invites it.'
+                'identity="service.locator". Another computer first needs the certificate for it: '
+                "`fleet hub invite --service locator`."
             )
         with self._pose_lock:
             if car not in self._poses:
@@ -419,7 +423,7 @@ class Fleet:
     def _query(self, target: str, command: PendingCommand, payload: bytes) -> None:
         """Send the command to one car, or to all, and queue the answers. Runs on a thread of the pool."""
         verb = command.request.verb
-        words = f"{target} may or may not carry it out: its gateway ended without an answer. Look at the car."
+        why_silent = f"{target} may or may not carry it out: its gateway ended without an answer. Look at the car."
         try:
             answers = self.bus.query(
                 keys.command_key(self.name, target, verb, self.bus.identity),
@@ -431,9 +435,9 @@ class Fleet:
                 if isinstance(answer, Sample):
                     command.inbox.put((time.monotonic(), answer))
                 else:
-                    words = "" if answer.words == "Timeout" else answer.words
+                    why_silent = "" if answer.words == "Timeout" else answer.words
         finally:
-            command.inbox.put((time.monotonic(), QueryEnded(target, words)))
+            command.inbox.put((time.monotonic(), QueryEnded(target, why_silent)))
 
     def _query_supervisor(self, command: PendingCommand) -> None:
         """Ask the supervisor for which cars it runs gateways, and queue their names. Runs on a thread of the pool."""
@@ -490,7 +494,7 @@ class Car(CarCommands[Outcome]):
 
         Within the block, nobody of the same rank can drive the car. At its end, the car is stopped and released. In the
         block, a command that is not carried out raises NotCarriedOut. Once another sender has taken or stopped the car,
-        every command raises LeaseLost. Entering the block can raise both, too.
+        every command raises LeaseLost. Either can also be raised when the block begins.
         With `take`, a person (`Fleet(kind="person")`) takes the car over from another person.
         """
         return Lease(self._fleet, self.name, partial(LeasedCar, self._fleet, self.name), take=take)

@@ -16,7 +16,8 @@ from schemas.suggestion import did_you_mean
 
 _KINDS: Final = ("programs", "fleets", "plans", "worlds")
 _SUFFIXES: Final = (".py", ".ipynb", ".yaml")
-# A fleet file names its plan and world by folders beside its own. The copies all lie in one folder, without these.
+# A fleet file of the package names its plan and world with their folders. All copies are in one folder, so the copied
+# fleet file names them without a folder.
 _OTHER_FILE: Final = re.compile(r"\.\./((?:plans|worlds)/[\w.-]+\.yaml)")
 
 
@@ -41,7 +42,7 @@ class ExampleName(click.ParamType[Path]):
     name = "NAME"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:  # noqa: ARG002 - click's signature
-        """Return the path of the example. Fail with the likely name if there is none."""
+        """Return the path of the example. If there is no such example, fail with the likely name."""
         if isinstance(value, Path):
             return value
         known = examples()
@@ -94,12 +95,13 @@ def show(path: Path) -> None:
 @click.argument("directory", default=Path(), type=click.Path(path_type=Path, file_okay=False), metavar="[DIR]")
 @click.option("--force", is_flag=True, help="Overwrite existing files.")
 def copy(path: Path, directory: Path, *, force: bool) -> None:
-    """Copy an example into DIR (default: here), with the plan and the world that a fleet file names."""
+    """Copy an example into DIR (default: here). With a fleet file, also copy the plan and the world that it names."""
     if directory.suffix == path.suffix:  # otherwise a directory with the name plan.yaml would be created
         raise click.UsageError(f"{directory} is the name of a file: give a directory, or nothing for the current one")
     text = path.read_text(encoding="utf-8")
     copies = {directory / path.name: _OTHER_FILE.sub(lambda match: Path(match[1]).name, text)}
-    for other in _OTHER_FILE.findall(text) if path.parent.name == "fleets" else ():
+    others = _OTHER_FILE.findall(text) if path.parent.name == "fleets" else ()
+    for other in others:
         copies[directory / Path(other).name] = (EXAMPLES / other).read_text(encoding="utf-8")
     for target in copies:
         if target.exists() and not force:

@@ -31,10 +31,10 @@ from fleet.commands.params import (
     complete_car,
     complete_cars,
     describe_missing,
+    expand_key,
     no_cars,
     resolve_cars,
     warn_if_missing,
-    written_out,
 )
 from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
@@ -240,7 +240,7 @@ def get(
 
     `red` means every sensor of red. `*` stands for any single part of a key.
     """
-    key_expression = check_key(written_out(keyexpr, fleet))
+    key_expression = check_key(expand_key(keyexpr, fleet))
     matched = topics_under(key_expression)
     if as_csv and as_json:
         raise click.UsageError("--csv and --json exclude each other: give one of them")
@@ -299,7 +299,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
     comparison. A comparison with a value that was not measured is unknown. Only readings for which CONDITION is true
     are shown.
     """
-    key_expression = check_key(written_out(keyexpr, fleet))
+    key_expression = check_key(expand_key(keyexpr, fleet))
     if when is not None:
         KeyCondition.of(when, key_expression)  # raises for a wrong condition
     with open_observer(connect, fleet, keyexpr) as client:
@@ -339,7 +339,7 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
     A rate is "-" if fewer than two messages came during the measurement. An age is "-" if no message came.
     """
     everything = [f"{fleet}/**", *(f"{fleet}/{service}/**" for service in SURVEYED_SERVICES)]
-    expressions = [check_key(written_out(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
+    expressions = [check_key(expand_key(each, fleet)) for each in ([keyexpr] if keyexpr else everything)]
     with open_observer(connect, fleet, keyexpr or "") as client:
         found = _survey(client, expressions, look_s)
         if not found:
@@ -454,7 +454,7 @@ def wait(
     if len(words) != 2:
         raise click.UsageError("give a KEY and one CONDITION in quotes, as: red/sensor/range 'range_m < 0.3'")
     keyexpr, condition = words
-    key_expression = written_out(keyexpr, fleet)
+    key_expression = expand_key(keyexpr, fleet)
     KeyCondition.of(condition, key_expression)  # raises for a wrong condition
     if for_s is not None and timeout_s is not None and for_s >= timeout_s:
         raise click.UsageError(f"--for {for_s:g} s must be shorter than --timeout {timeout_s:g} s")

@@ -35,7 +35,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 
 
 def bus_options(function: _Function) -> _Function:
-    """Add --connect, --fleet and --as. Errors of the bus and of names become one line."""
+    """Add --connect, --fleet and --as. The command runs in `cli_errors`."""
 
     @connect_option()
     @fleet_option()
@@ -53,17 +53,17 @@ def serving_options(port: int) -> Callable[[_Function], _Function]:
     """Add --port and --address for a program that serves others. By default it serves `port` on this computer only."""
 
     def add(function: _Function) -> _Function:
-        address = click.option(
+        address_option = click.option(
             "--address", metavar="ADDRESS", default=LOOPBACK, show_default=True, help="Serve at this address."
         )
-        at = click.option(
+        port_option = click.option(
             "--port",
             type=Number(int, 0, 65535),
             default=port,
             show_default=True,
             help="Serve at this port. With 0, at any free port.",
         )
-        return at(address(function))
+        return port_option(address_option(function))
 
     return add
 
@@ -109,8 +109,8 @@ def cli_errors() -> Iterator[None]:
         vars(error)["message"] = complete_hints(error.message, hint_options())  # click declares `message` final
         raise
     except (BadEndpoint, ValueError) as error:  # BadKey is a ValueError
-        # This is a BadFile of schemas.yaml_document, recognized by its attribute: importing the class would slow down
-        # every other command.
+        # Only a BadFile of schemas.yaml_document has `problems`. It is recognized in this way, because importing the
+        # class would slow down every other command.
         if hasattr(error, "problems"):
             raise WrongFile(str(error)) from None
         raise click.UsageError(complete_hints(str(error), hint_options())) from None
@@ -138,10 +138,13 @@ def end_with(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Ne
         raise no_cars(client)
     print_outcomes(outcomes, as_json=as_json)
     failed = [outcome for outcome in outcomes if not outcome.ok]
-    unanswered = all(outcome.phase == NO_ANSWER for outcome in outcomes)
-    # --fleet may be wrong, or our certificate may have been revoked.
-    if unanswered and (words := describe_other_fleets(client) or (not client.cars() and why_refused(client))):
-        say(words, err=True)
+    if all(outcome.phase == NO_ANSWER for outcome in outcomes):
+        # --fleet may be wrong, or our certificate may have been revoked.
+        words = describe_other_fleets(client)
+        if not words and not client.cars():
+            words = why_refused(client)
+        if words:
+            say(words, err=True)
     wrong = bool(failed) and all(outcome.reason == Reason.BAD_VALUE for outcome in failed)
     raise SystemExit(2 if wrong else 1 if failed else 0)
 

@@ -112,7 +112,7 @@ class Choice(click.Choice[str]):
         if ctx is not None and set(ctx.params.get("cars", ())) & set(self.choices):
             near = f"Write the {self._what} last."
         if self._what == "motion" and duration_s(str(value)) is not None:
-            near = f"How long: --for {value}"
+            near = f"Write how long as: --for {value}"
         all_of_them = f"Choose from: {', '.join(self.choices)}."
         return f'"{value}" is not a {self._what}. {near or all_of_them}'
 
@@ -180,7 +180,7 @@ def _ask_bus(ctx: click.Context, ask: Callable[[Bus, str], Iterable[str]]) -> li
         with suppress(Exception), Bus.open(values.get("connect")) as bus:
             found.extend(ask(bus, fleet))
 
-    logging.disable()
+    logging.disable()  # completion must not print
     thread = threading.Thread(target=look, daemon=True)
     thread.start()
     thread.join(COMPLETION_TIMEOUT_S)
@@ -290,14 +290,15 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
     """Return the cars of a group, from the running fleet, or else from the fleet file here. Raises click's errors."""
     status = ask_status(client.bus, client.name)
     groups = _groups_of_status(status) if status else _groups_of_file()
-    if group not in groups:
+    if group in groups:
+        return groups[group]
+    if groups:
         near = did_you_mean(group, groups).replace("mean ", "mean @")
-        there = f"Groups: @{', @'.join(sorted(groups))}." if groups else ""
-        if not groups:
-            whose = "The running fleet has none. Its file" if status else "fleet.yaml"
-            there = f"{whose} can define groups, such as `groups: {{a: [red, blue]}}`."
-        raise click.ClickException(f'There is no group "@{group}". {near or there}')
-    return groups[group]
+        hint = near or f"Groups: @{', @'.join(sorted(groups))}."
+    else:
+        whose = "The running fleet has none. Its file" if status else "fleet.yaml"
+        hint = f"{whose} can define groups, such as `groups: {{a: [red, blue]}}`."
+    raise click.ClickException(f'There is no group "@{group}". {hint}')
 
 
 def _groups_of_status(status: Iterable[Any]) -> Mapping[str, Sequence[str]]:
@@ -312,7 +313,7 @@ def _groups_of_file() -> Mapping[str, Sequence[str]]:
 
 
 def complete_people(_: click.Context, __: click.Parameter, incomplete: str) -> list[str]:
-    """Return the people in the fleet file here for the shell. Never fails or prints."""
+    """Complete, in the shell, the name of a person in the fleet file here. Never fails or prints."""
     file = _file_here()
     return sorted(name for name in (file and file.people) or () if name.startswith(incomplete))
 
@@ -327,7 +328,7 @@ def _file_here() -> "FleetFile | None":
     return None
 
 
-def written_out(keyexpr: str, fleet: str) -> str:
+def expand_key(keyexpr: str, fleet: str) -> str:
     """Expand a key expression. Raises keys.BadKey."""
     return canon(keys.expand(keyexpr, keys.check_name(fleet, "fleet name")))
 
@@ -372,7 +373,7 @@ def describe_missing(client: Fleet, key_expression: str, what: str) -> str:
 
 
 def _likely_car(name: str, cars: Sequence[str]) -> str:
-    """Return a text about the likely car, the topic with this name, or the connected cars."""
+    """Return a text for an unknown car: the likely car, else the topic of this name, else the connected cars."""
     topic = None if (near := did_you_mean(name, cars)) else likely_name(name)
     return near or (f"Did you mean '*/{topic}'?" if topic else f"Connected: {', '.join(cars)}.")
 

@@ -209,7 +209,7 @@ class CarView:
         motors: dict[str, Any] = {"state": claim.what, "basis": claim.basis}
         past = claim if claim.is_stale else claim.past
         if past is not None:  # show an old claim as a past one, with its age
-            motors = {"state": UNKNOWN, "basis": "", "past": past.basic, "past_s": int(past.age_s or 0)}
+            motors = {"state": UNKNOWN, "basis": "", "past": past.with_basis, "past_s": int(past.age_s or 0)}
         shown: dict[str, Any] = {"motors": motors, "hold": None, "lease": None, "estops": []}
         if safety is None:
             return shown

@@ -23,7 +23,7 @@ from schemas.words import Basis, LinkState, Motors, RunState
 LAST_CLAIM_TIMEOUT_S: Final = 1.0
 """Timeout for the last state of a gateway that has ended normally. This state may arrive after the gateway's end."""
 NEVER_REACHED: Final = "never reached"
-"""First words of the result for a car to which no gateway had a link."""
+"""How the result begins for a car to which no gateway had a link."""
 GATEWAY_START_TIMEOUT_S: Final = 20.0
 """Timeout for the first heartbeat of a gateway that has not yet reached its car."""
 NOT_TRIED: Final = "not connected yet"
@@ -226,7 +226,7 @@ def describe_end(results: Mapping[str, str]) -> str:
 
 
 _RESULTS: Final = (NOT_STOPPED, NOT_CONFIRMED, STOPPED, STOP_SENT, NEVER_REACHED)
-"""The first words of each result."""
+"""How each result begins."""
 
 
 def _why(process: ManagedProcess) -> str:

@@ -122,7 +122,7 @@ def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
         Text(link, _LINK.get(link, "yellow")),
         Text.assemble(state.mode.asked, " ", (state.mode.verdict, _VERDICT.get(state.mode.verdict, ""))),
         Text(state.motion.motion),
-        Text(row.motors.basic if state.safety.motors else ""),
+        Text(row.motors.with_basis if state.safety.motors else ""),
         Text(held or name_of(state.safety.lease.holder), "red" if held else ""),
         Text(f"{volts} {battery.level}" if is_low else volts, "red" if is_low else ""),
         Text(rate, justify="right"),

@@ -43,7 +43,7 @@ class ServiceNotifier:
         """Tell systemd that the loop is running, if a message is due."""
         if self._socket is None or now < self.due_at:
             return
-        self.due_at = now + min(self._interval_s, READY_RETRY_S)
+        self.due_at = now + min(self._interval_s, READY_RETRY_S)  # in case the message cannot be sent
         with suppress(OSError):  # systemd restarts, or its queue is full: the next message follows soon
             self._socket.sendto(self._message, self._address)
             self._message = b"WATCHDOG=1"

@@ -52,7 +52,7 @@ class CarTimeline:
         if topic in _CLAIMS:
             name, claim_of = _CLAIMS[topic]
             claim = claim_of(message)
-            self._changed(name, f"{name} {claim.basic}", claim.why, at_ns)
+            self._changed(name, f"{name} {claim.with_basis}", claim.why, at_ns)
         elif topic == "event/command":
             words = f": {message.words or message.reason}" if message.words or message.reason else ""
             basis = f" ({message.basis})" if message.basis else ""
