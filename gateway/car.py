@@ -260,7 +260,7 @@ class CarGateway:
     async def _check_rival(self) -> None:
         """Check a second time for another gateway. If two started together, the one with the higher boot id ends."""
         await asyncio.sleep(RIVAL_CHECK_DELAY_S)
-        await self._has_rival()
+        await self._has_rival()  # raises AlreadyServed if this gateway has to end
         await self._writer.finished.wait()
 
     async def _has_rival(self) -> bool:

@@ -50,10 +50,10 @@ class LinkLoop:
         on_gap: Callable[[float], None],
         log_open: Callable[[], None],
     ) -> None:
-        """Call `on_gap` to detect a gap of the loop before bytes are judged.
+        """Make the loop of a link. `on_gap` is called before bytes are judged, to detect a gap of the asyncio loop.
 
-        Call `log_open` when the opening of the link should be logged. That is at once, or, if the last link was soon
-        lost, when this one is proven (`Attempts`).
+        `log_open` is called when the opening of the link should be logged: at once, or if the last link was soon lost,
+        when this one is proven (`Attempts`).
         """
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()

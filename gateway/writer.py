@@ -27,7 +27,7 @@ class Writer:
         on_opened_as_changed: Callable[[float], None],
         notifier: ServiceNotifier,
     ) -> None:
-        """Call `on_gap` to detect a gap of the loop before a frame is chosen.
+        """Make the writer of a car. `on_gap` is called before a frame is chosen, to detect a gap of the loop.
 
         `on_opened_as_changed` is called when `Driver.opened_as` has changed. `notifier` is fed by each turn and each
         frame, and by nothing else. So if no frame can be written any more, systemd starts another gateway, which stops

@@ -262,7 +262,7 @@ class CarPublisher:
         self._put_kept(name, message, now, self._wall.ns(now))
 
     def on_slept(self, slept_s: float) -> None:
-        """Make the stored values older by a sleep of the computer, s, which the monotonic clock does not count."""
+        """Add a sleep of the computer (s) to the age of the stored values: the monotonic clock does not count it."""
         for history in self._histories.values():
             history.age(slept_s)
 

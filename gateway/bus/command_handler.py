@@ -160,9 +160,10 @@ class CommandHandler:
                 self._publisher.publish_log(record)
                 continue
             self._log_command(record)
-            first = request if request is not None and record.command.id == command_id else None
-            self._publisher.publish_command(record, None if first is None else (first.payload or b"", first.encoding))
-            request = None if first is not None else request
+            original: tuple[bytes, str] | None = None
+            if request is not None and record.command.id == command_id:
+                original, request = (request.payload or b"", request.encoding), None  # only in the first record
+            self._publisher.publish_command(record, original)
             if record.phase is Phase.SENT:
                 self._sent.add(record.command.id)
 

@@ -60,7 +60,7 @@ class EstopSync:
         self._changed = asyncio.Event()
         self._alive: set[str] = set()
         self._due: set[str] = set()
-        """Gateways that must be queried, as they started or `sync_soon` was called, and have not answered yet."""
+        """Gateways that still have to answer a query, because they started, or because `sync_soon` was called."""
 
     def on_tokens(self, changes: Mapping[str, bool]) -> None:
         """Record that gateways of the fleet started or ended."""

@@ -42,8 +42,8 @@ from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason,
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
-"""A drive that waits for the car expires after the announced wait, or after its own duration if that is longer, and
-this margin."""
+"""A drive that waits for the car expires this long after the announced wait, or after its own duration if that is
+longer."""
 
 
 class Controller(Generic[D_co]):
@@ -129,7 +129,7 @@ class Controller(Generic[D_co]):
         return f"{what}, for {left_s:.1f} s at most"
 
     def is_free(self, now: float) -> bool:
-        """Return True if a command of somebody who may command the car would be sent now."""
+        """Return True if a command would be sent now, provided that its sender may command the car."""
         return self.driver.model.link_open and self.driver.accepts_commands(now)
 
     def wait_s(self, what: Action, now: float) -> float:
@@ -169,8 +169,8 @@ class Controller(Generic[D_co]):
             self._log.record(pending, Phase.ASKED, now)
         if isinstance(what, Stop | EmergencyStop):
             return self._stop(pending, now)
-        # Track the drives of a stream even if they are refused: after a stop, the stream must not drive the car as soon
-        # as somebody else's lease ends.
+        # Track the drives of a stream even if they are refused. Otherwise a stream that goes on after a stop would
+        # drive the car as soon as somebody else's lease ends.
         halted = isinstance(what, Drive) and not self._may_drive(command, what, now)
         refusal = refusals.refuse(command, self._context(now, self.driver.refusal(what)))
         if refusal is not None:
@@ -276,9 +276,9 @@ class Controller(Generic[D_co]):
     def _stop(self, pending: Pending, now: float) -> Answer:
         """Stop the car, for a stop, an e-stop or a pause."""
         command = pending.command
-        sender, latched = command.sender, command.note
+        sender, note = command.sender, command.note
         if isinstance(command.what, Pause):
-            latched = self._latch_pause(command, command.what.why, now)
+            note = self._latch_pause(command, command.what.why, now)
         elif isinstance(command.what, EmergencyStop):
             why, fleet_wide = command.what.why, command.what.fleet_wide
             estop = Estop(command.id, sender.name, why, command.asked_ns, fleet_wide, sender.kind)
@@ -286,7 +286,7 @@ class Controller(Generic[D_co]):
             until = f"the e-stop lasts until `fleet resume{'' if fleet_wide else f' {self.car}'} --estops`"
             why = f": {estop.why}" if estop.why else ""
             self._log.log(Level.ERROR, "estop", f"{self.car} is emergency-stopped by {sender.name}{why}; {until}", now)
-            latched = f"{until}; {command.note}" if command.note else until
+            note = f"{until}; {command.note}" if command.note else until
         elif sender.kind is not Rank.COORDINATOR:
             self.safety.put_on_hold(sender.name, command.asked_ns, sender.kind)
         self.driver.halt(f"{command.verb} by {sender.text_name}", now, by=sender.name)
@@ -297,11 +297,11 @@ class Controller(Generic[D_co]):
         if not self.driver.model.is_heard:
             silent_s = self.driver.model.unheard_s(now)
             silent = f"{self.car} may not get this stop: it has been silent for {silent_s:.0f} s. Look at the car."
-            latched = f"{silent} ({latched})" if latched else silent
+            note = f"{silent} ({note})" if note else silent
         worst = self.driver.worst_s(now)
-        self._log.record(pending, Phase.QUEUED, now, words=latched, worst_case_s=worst)
+        self._log.record(pending, Phase.QUEUED, now, words=note, worst_case_s=worst)
         self.driver.stop(FrameOrigin.STOP, now, pending)
-        return Answer(Phase.QUEUED, words=latched, worst_case_s=worst)
+        return Answer(Phase.QUEUED, words=note, worst_case_s=worst)
 
     def _not_stopped(self, later: str) -> str:
         """Describe what it means for the car that a stop cannot be sent, and what will happen to the car later."""

@@ -131,7 +131,7 @@ class Safety:
         known = {*self._estops, *self._ended}
         shared = [each for each in estops if each.fleet_wide]
         latched = [self.latch(each) for each in shared if each.id not in known]
-        for each in shared:  # correct the rank, as a gateway without people latches a lead's e-stop as a person's
+        for each in shared:  # correct the rank: a gateway that knows no people takes a lead for a person
             first = self._estops.get(each.id)
             if first is not None and strength(each.rank) > strength(first.rank):
                 self.latch(each)

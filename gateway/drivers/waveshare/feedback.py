@@ -61,7 +61,8 @@ def read_line(line: bytes, at: float) -> list[Event]:
         except (ValueError, RecursionError):
             # A truncated object and a whole one can share a line, so look on after the truncated one.
             place = text.find("{", start + 1)
-            place = place if place >= 0 else len(text)
+            if place < 0:
+                place = len(text)
             events.append(Rejected(text[start:place].encode("latin-1"), at, Cause.TRUNCATED))
             continue
         events.append(_event(found, text[start:place].encode("latin-1"), at))

@@ -138,7 +138,7 @@ class CarMonitor:
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 
     def _on_changed_expectation(self, now: float) -> None:
-        """Log that this car cannot show its stops, or that it runs another program. Handle the second case."""
+        """Log that this car cannot show its stops, or that it runs another program. If it does, drop old claims."""
         name, learned = self.model.name, self.model.learned
         if learned.shows is Shows.NO:
             words = cases.NO_REACTION.why(name)
@@ -160,13 +160,13 @@ class CarMonitor:
     def _apply_platform(self, now: float) -> None:
         """Use the profile of the detected platform.
 
-        Wait with that during the first frames of a stop, because each stop is made for one platform. Do not wait if the
-        readings show an open mode, because general stops do not end it.
+        Postpone this during the first frames of a stop, because each stop is made for one platform. Do not postpone it
+        if the readings show an open mode, because general stops do not end a mode.
         """
         model = self.model
         if model.platform.profile is model.profile or not model.link_open:
             return
-        # With a wrong head, the car ignores our named frames, and its readings cannot be read. So do not wait either.
+        # With a wrong head, the car ignores our named frames, and its readings cannot be read. So do not postpone that.
         has_other_head = model.platform.profile.dialect.head != model.profile.dialect.head
         may_replace = has_other_head or (model.platform.open_mode and model.stop_style is StopStyle.BOTH)
         if not may_replace and not self._executor.accepts_commands(now):
@@ -176,7 +176,7 @@ class CarMonitor:
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
         if model.platform.auto:  # else a contradiction has reported the corrected platform
             self._log.log(Level.INFO, "platform_settled", words, now)
-        if has_other_head and self._is_idle:  # a drive has frames without a head: neither end nor delay it
+        if has_other_head and self._is_idle:  # the frames of a drive have no head: let it go on
             self._stops.recover(now, words)
         elif before not in (Platform.UNKNOWN, model.profile.kind):
             self._on_other_program(now, words)

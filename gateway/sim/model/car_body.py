@@ -156,7 +156,7 @@ class CarBody:
         return hit[0] if hit[1] >= SONAR_STEEPEST else None
 
     def line(self, now: float) -> tuple[bool, bool, bool, bool]:
-        """Return for each of the four line sensors whether it sees the line."""
+        """Return one value for each of the four line sensors: True if it sees the line."""
         self._move(now)
         if not self._world.line:
             return (False, False, False, False)
@@ -164,7 +164,7 @@ class CarBody:
         return (seen[0], seen[1], seen[2], seen[3])
 
     def obstacle(self, now: float) -> tuple[bool, bool]:
-        """Return for each infrared sensor, turned 20 degrees outward, whether it sees an obstacle."""
+        """Return one value for each infrared sensor, turned 20 degrees outward: True if it sees an obstacle."""
         self._look(now)
         seen = []
         for side in (1, -1):
@@ -186,7 +186,7 @@ class CarBody:
         return wall is None or hit[0] <= wall
 
     def light(self, now: float) -> tuple[bool, bool]:
-        """Return for the left and the right light sensor whether it sees a lamp."""
+        """Return one value for the left and one for the right light sensor: True if it sees a lamp."""
         self._look(now)
         seen = [False, False]
         for lamp in self._world.lamps:
