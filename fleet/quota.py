@@ -71,5 +71,5 @@ class Quota:
         return 0 < self.session_limit <= size or segments >= MAX_SEGMENTS
 
     def excess(self, size: int) -> int:
-        """Return by how many bytes all sessions together exceed the quota, or 0 if they do not."""
+        """Return the number of bytes by which all sessions together exceed the quota, or 0 if they do not."""
         return max(0, size - self.total) if self.total else 0

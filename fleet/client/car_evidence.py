@@ -68,7 +68,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
 
 
 def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
-    """Return by car the stamp of its newest state, s since the epoch by its gateway's clock."""
+    """Return the stamp of each car's newest state, s since the epoch by its gateway's clock."""
     found: dict[str, float] = {}
     for reading in readings:
         key = keys.parse(reading.key)
@@ -78,10 +78,10 @@ def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
 
 
 def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]:
-    """Return by car how far its gateway's clock is off. Cars whose clock is right are left out.
+    """Return how far the clock of each car's gateway is off, s. Cars whose clock is right are left out.
 
-    newest_s: by car, the newest stamp in its answers. For cars with an odd stamp only, listen to the states that they
-    publish, for at most _CLOCK_LISTEN_S.
+    newest_s: by car, the newest stamp in its answers. If a stamp is odd, listen to the states of that car for at most
+    _CLOCK_LISTEN_S.
     """
     now_s = time.time()
     odd = {car for car, at_s in newest_s.items() if abs(at_s - now_s) > MAX_CLOCK_OFF_S}

@@ -103,7 +103,7 @@ def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
 
 
 def rest_words(motors: CarClaim, car: str) -> str:
-    """Return in words what a gateway's last claim says about the car's stop: stopped, stop sent, or not confirmed."""
+    """Describe what a gateway's last claim says about the car's stop: stopped, stop sent, or not confirmed."""
     if motors.what != Motors.OFF:
         return f"{NOT_CONFIRMED}: {car} has not shown that it stopped"
     if motors.basis == Basis.SHOWN:

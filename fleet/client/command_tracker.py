@@ -21,8 +21,8 @@ WAIT_SAID_S: Final = 1.0
 SEND_AGAIN_INTERVAL_S: Final = 0.5
 """Interval at which a stop without an answer is sent again. A lost session tries to connect again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
-"""Interval of the checks whether the bus is there, while a stop has no answer. A session is lost for at least twice as
-long."""
+"""Interval at which a stop without an answer checks whether the bus is there. A lost session stays lost for at least
+twice as long."""
 _MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of up to some hundred cars
 
 
@@ -138,13 +138,15 @@ class PendingCommand:
                     progress.on_presence(now, alive=True)  # the hub was lost, not the gateway
                 if now >= progress.deadline and self.inbox.empty():  # after a stall, an answer may be queued
                     progress.give_up(now)
-            until = min((each.deadline for each in waiting), default=now + ANSWER_TIMEOUT_S)
-            until = until if self._late_at is None else min(until, self._late_at)
-            until = until if now >= waits_at else min(until, waits_at)
+            due = [each.deadline for each in waiting] or [now + ANSWER_TIMEOUT_S]
+            if self._late_at is not None:
+                due.append(self._late_at)
+            if now < waits_at:
+                due.append(waits_at)
             if self.is_stop and (self._awaits_bus or not all(each.answered for each in waiting)):
-                until = min(until, now + BUS_LOOK_INTERVAL_S)
+                due.append(now + BUS_LOOK_INTERVAL_S)
             try:
-                at, item = self.inbox.get(timeout=max(0.0, until - now))
+                at, item = self.inbox.get(timeout=max(0.0, min(due) - now))
             except queue.Empty:
                 continue
             self._take(item, at)
@@ -237,7 +239,10 @@ class PendingCommand:
             self._of(item.car).on_event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
 
     def _on_presence(self, change: PresenceChange, at: float) -> None:
-        (self._present.add if change.alive else self._present.discard)(change.car)
+        if change.alive:
+            self._present.add(change.car)
+        else:
+            self._present.discard(change.car)
         progress = self._progress.get(change.car)
         if progress is None:
             if change.alive and self.lost_bus and self._named is None:

@@ -430,7 +430,7 @@ def doubtful(evidence: CarEvidence) -> set[str]:
 
 
 def describe_reports(health: Any) -> str:
-    """Return in words what is known about a car's reports: their rhythm, and whether they show that a stop arrived."""
+    """Describe what is known about a car's reports: their rhythm, and whether they show that a stop arrived."""
     rhythm = ""
     if health.HasField("interval_s"):
         blocks = "".join(

@@ -65,7 +65,7 @@ STOP_VERBS: Final = STOPPING_VERBS | {RELEASE, ESTOP_FLEET}
 
 
 def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:
-    """Return in words what a command did. `results` are ordered, the most specific first, such as reason and phase."""
+    """Describe what a command did. `results` are ordered, the most specific first, such as reason and phase."""
     tables = [EFFECTS.get(verb, {}), *([_STOP_FAILURES] if verb in STOP_VERBS else ()), EFFECTS[_ANY]]
     template = next((table[result] for result in results for table in tables if result in table), "{words}")
     shown = f" {detail}" if detail else ""

@@ -68,9 +68,7 @@ def describe_shortfalls(
     readings: sorted as `merge` sorts.
     """
     every, has_states = list(readings), False
-    lines = [
-        f"{key}: {count} missing between others, lost on the way. Try again." for key, count in gaps(every).items()
-    ]
+    lines = [f"{key}: {count} missing in between, lost on the way. Try again." for key, count in gaps(every).items()]
     for key, group in itertools.groupby(every, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
         if topic is None:

@@ -120,7 +120,7 @@ class Reading:
 
 
 ReadingFilter: TypeAlias = Callable[[Reading], bool | None]
-"""Returns True for a reading of a stream. False, and None for unknown, drop the reading."""
+"""Returns True to keep a reading of a stream. False, or None for unknown, drops it."""
 
 
 def reading_of(sample: Sample) -> Reading:

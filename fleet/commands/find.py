@@ -126,7 +126,7 @@ def _search(
         about = of_session(session)
         there |= {*about.cars}
         if is_searched := about.end_ns >= since_ns:
-            searched = [*({*about.cars} & {*(cars or about.cars)})]
+            searched = [car for car in about.cars if not cars or car in cars]
             found = find_in(session, expression, searched, for_s, since_ns)
             yield path, found
             for words in found.left_out.words():
@@ -148,7 +148,7 @@ def _mark_sessions(found: list[tuple[Path, "Hit"]], expression: "Expression") ->
         count = "1 hit" if len(of_session) == 1 else f"{len(of_session)} hits"
         text = f"{expression}: {of_session[0].car}, {count}"[:MAX_MARK_CHARACTERS]
         try:
-            # The author is the person without the process, so that the same search finds its own mark again tomorrow.
+            # The author is only the person, without host and process. So the same search recognizes its mark tomorrow.
             add_mark(path, of_session[0].begin_ns, text, keys.person_of(default_sender(chosen_person())))
         except (NoMark, OSError) as error:
             words = error.strerror if isinstance(error, OSError) else error

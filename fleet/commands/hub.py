@@ -358,7 +358,7 @@ def _stop_first(endpoint: str, car: str) -> None:
 
 
 def _tries(within_s: float) -> Iterator[bool]:
-    """Yield for each try within this time whether it is the last one."""
+    """Yield once for each try within this time: True if it is the last one."""
     deadline = time.monotonic() + within_s
     while not (is_last := time.monotonic() > deadline):
         yield is_last

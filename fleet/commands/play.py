@@ -129,7 +129,7 @@ def play(
                 f"{', '.join(map(printable, there)) or 'no car'}; Ctrl-C ends"
             )
             player.remember(found.messages(expressions, first_ns - INITIAL_VALUES_NS, first_ns))
-            # The first message does not have the earliest time if the clock went back.
+            # Without --offset, do not begin at `first_ns`: if the clock went back, later messages have earlier times.
             from_ns = part.start_ns if offset is None else first_ns
             progress = _Progress((end_ns - begin_ns) / 1e9)
             origin_s = time.monotonic()

@@ -57,7 +57,8 @@ class CommandLedger:
     def on_frame(self, frame: Any) -> None:
         """Handle a frame to the car (fleet.v1.TxFrame)."""
         text = frame.data.decode("ascii", "backslashreplace")
-        text = text if frame.written else f"{text} NOT written"
+        if not frame.written:
+            text = f"{text} NOT written"
         command = self._commands.get(frame.command_id)
         if command is not None:
             command.wire = [*command.wire, text][-MAX_WIRE_FRAMES:]

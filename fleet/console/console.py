@@ -168,7 +168,10 @@ class Console:
 
     def _on_replay(self, token: str, alive: bool) -> None:  # noqa: FBT001 - as `Bus.watch_tokens` calls it
         """Note a replay that began or ended. Runs on a Zenoh thread."""
-        (self._replays.add if alive else self._replays.discard)(token)
+        if alive:
+            self._replays.add(token)
+        else:
+            self._replays.discard(token)
 
     def _color_of(self, car: str, index: int) -> str:
         return hex_color(self._colors.get(car) or car_color(car, index))

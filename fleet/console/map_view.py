@@ -99,7 +99,7 @@ class MapView:
                 del found[car]
 
     def places(self, now: float) -> dict[str, list[Any]]:
-        """Return for each car, as JSON values: x, y (m), heading (rad), frame, error of x, y (m), age if stale (s)."""
+        """Return the place of each car as JSON: x, y (m), heading (rad), frame, error of x, y (m), age if stale (s)."""
         return {
             car: [
                 round(place.x_m, 3),
@@ -114,7 +114,7 @@ class MapView:
         }
 
     def trails(self, now: float, since: float = -math.inf) -> dict[str, _Points]:
-        """Return for each car the points of its trail after a time. A point is its time (ms), x and y (m)."""
+        """Return the points of each car's trail after a time. A point is its time (ms), x and y (m)."""
         begin = max(since, now - TRAIL_S)
         found = {
             car: [(round(at * 1e3), round(x_m, 3), round(y_m, 3)) for at, x_m, y_m in trail if at > begin]

@@ -45,7 +45,7 @@ _UNSAVED: Final = "It cannot be saved: a restarted coordinator will not know it.
 
 @dataclass(slots=True)
 class Coordinator:
-    """Commands cars by a plan. `client` is of kind coordinator, its sender begins with SENDER.
+    """Commands cars by a plan. `client` has the kind coordinator, and a sender that begins with SENDER.
 
     The coordinator calls `on_decision` for each changed decision, and `on_failure` for each failed command and each
     warning about a plan from the bus. `listed` has the cars in the fleet file, and is empty without a file. The caller
@@ -106,8 +106,8 @@ class Coordinator:
                 for query in self._early:
                     self._answer(query, observer)
                 while not has_ended():
-                    # Read the hubs before the inbox: if a hub is gone, the inbox then already contains the tokens that
-                    # it lost.
+                    # Read the hubs before the inbox. If a hub is gone by then, the inbox already says which gateways
+                    # were lost with it.
                     linked_hubs = bus.hubs
                     self._drain_inbox(observer, pool)
                     now = time.monotonic()

@@ -57,8 +57,8 @@ class FleetObserver:
 
     def snapshot(self, busy: Iterable[str]) -> FleetSnapshot:
         """Return a snapshot. `busy` are the cars with a pending command."""
-        # An unlisted name counts as a car once it has published its states. Before that, only a limited number of them
-        # count, and only while they are present.
+        # An unlisted name counts as a car once it has published its states. Before that, only a limited number of
+        # such names count, and only while they are present.
         cars = {car: known for car, known in self.cars.items() if known.listed or car in self._confirmed}
         unconfirmed = (each for each in self.cars.items() if each[1].present and each[0] not in cars)
         cars.update(list(islice(unconfirmed, MAX_UNCONFIRMED_CARS)))
@@ -82,8 +82,8 @@ class FleetObserver:
             self._absent_since.setdefault(car, now)
         self.cars[car] = replace(self.listed.get(car, CarSnapshot()), present=alive)
         if (state := self.states.get(car)) is not None:
-            # A gateway that comes back counts as new. When a recording is played in a loop, it is the same gateway each
-            # time.
+            # A gateway that comes back counts as new, even if its `boot_id` is that of before, as when a recording is
+            # played in a loop.
             readings = {topic: each for topic, each in state.newest_by_topic.items() if topic.startswith("sensor/")}
             self.states[car] = CarState(car, alive, readings)
 
@@ -101,7 +101,7 @@ class FleetObserver:
             each.pop(car, None)
 
     def on_sleep(self, slept_s: float) -> None:
-        """Make all readings older by a sleep of the computer: the clock of their times stood still meanwhile."""
+        """Add a sleep of the computer to the age of all readings, because the clock of their times stood still."""
         for state in self.states.values():
             state.on_sleep(slept_s)
 
@@ -111,7 +111,7 @@ class FleetObserver:
             self.cars[car] = replace(self.cars[car], refused=refusal)
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
-        """Add a message. `wall_s` is the wall clock for an answer to a query, which may be old, and otherwise None."""
+        """Add a message. An answer to a query may be old: then `wall_s` is the wall clock. Otherwise it is None."""
         key = keys.parse(sample.key)
         topic = None if key is None else topics.TOPICS.get(key.topic)
         if key is None or topic is None:

@@ -332,7 +332,7 @@ def _effects_in_force(plan: Plan, rules: Mapping[int, RuleState]) -> Iterator[tu
 
 
 def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, PinnedRole]:
-    """Return by car the role that a rule pins. If several rules pin roles of one car, the first one counts."""
+    """Return the roles that rules pin, by car. If several rules pin roles of one car, the first one counts."""
     result: dict[str, PinnedRole] = {}
     for _, rule, state, effect in _effects_in_force(plan, rules):
         if effect.role is not None:

@@ -189,7 +189,7 @@ class Catalog:
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
 
     def left_out(self) -> dict[str, LeftOut]:
-        """Return by session the messages that no view has, because they cannot be decoded.
+        """Return the messages of each session that no view has, because they cannot be decoded.
 
         Only topics for which a question has asked so far are counted.
         """
@@ -203,7 +203,7 @@ class Catalog:
         return found
 
     def nulled(self) -> dict[str, list[str]]:
-        """Return by session, in words for each column, how many values are null because they had another type.
+        """Return texts by session: for each column, how many values are null because they had another type.
 
         Only topics for which a question has asked so far are counted.
         """

@@ -150,7 +150,8 @@ class ProcessSet:
             leave_s = longest_hub_silence_s(process.pulse.sign)
             if process.kind in _HEARTBEAT_KINDS:
                 leave_s = longest_silence_s(process.pulse.sign, many=many, may_move=may_move(process))
-                leave_s = leave_s if self._admission.may_kill(now) else inf
+                if not self._admission.may_kill(now):
+                    leave_s = inf
             action = process.status.turn(now, since(process), leave_s)
             if action is RestartAction.KILL and process.child is not None:
                 if process.status.words.startswith(HUNG):

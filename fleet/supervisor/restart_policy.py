@@ -84,7 +84,7 @@ class ProcessState:
         return self.state in (RunState.STARTING, RunState.RUNNING, RunState.ENDING)
 
     def silent_s(self, now: float, listening_since: float | None) -> float:
-        """Return for how long heartbeats could have been received, but none was. 0 if none is expected."""
+        """Return how long no heartbeat was received although it could have been. 0 if none is expected."""
         if listening_since is None or self._killed or not self.alive:
             return 0.0
         if self.state is RunState.ENDING and not self.patience.to_the_end:

@@ -259,7 +259,7 @@ class Supervisor:
             hub.status.schedule(now)
 
     def _check_recorder(self, now: float) -> None:
-        """Report that nothing is recorded if the recorder does not start, and no other of this fleet is heard."""
+        """Report that nothing is recorded, if our recorder does not run and no other one of this fleet is heard."""
         recorder = self.processes.get(RECORDER)
         if recorder is None or self._shutdown_requested.is_set() or now < self._recorder_heard_at + RECORDER_LOST_S:
             return

@@ -424,7 +424,10 @@ class Bus:
                     if number != self._number and self._overlap is None:
                         return
                     is_twin = self._overlap is not None and (key in alive) is came  # both sessions see it
-                    (alive.add if came else alive.discard)(key)
+                    if came:
+                        alive.add(key)
+                    else:
+                        alive.discard(key)
                     awaited.discard(key)
                 if not is_twin:
                     callback(key, came)

@@ -57,7 +57,7 @@ def _build_class(name: str, data: bytes) -> type[Message] | None:
 
 
 def compare_schema(message_class: type[Message]) -> str:
-    """Return in words how a recorded schema differs from ours of the same name, or SAME_SCHEMA."""
+    """Describe how a recorded schema differs from ours of the same name, or return SAME_SCHEMA."""
     name = message_class.DESCRIPTOR.full_name
     try:
         today = _field_shapes(messages.message_class(name).DESCRIPTOR)

@@ -160,12 +160,12 @@ class Session:
 
     @property
     def undescribed(self) -> str:
-        """Return in words what is wrong with session.json of a directory. Empty if it can be read."""
+        """Describe what is wrong with session.json of a directory. Empty if it can be read."""
         unread = self.description is None and self.path.is_dir()
         return "is missing or unreadable: it names recorder and marks" if unread else ""
 
     def lacking(self, messages: int) -> str:
-        """Return in words how many messages session.json counts beyond `messages`. Empty if none, or if not known."""
+        """Describe how many messages session.json counts beyond `messages`. Empty if none, or if not known."""
         info = self.description
         gone = session_dir.gone_messages(info) if info is not None else 0
         total = info.messages - gone if info is not None and info.closed and gone is not None else 0
@@ -412,7 +412,10 @@ class Session:
     def _add_damage(self, reader: McapReader) -> None:
         if reader.damage:
             self.damage[reader.path] = reader.words
-            (self.unended.add if reader.only_cut else self.unended.discard)(reader.path)
+            if reader.only_cut:
+                self.unended.add(reader.path)
+            else:
+                self.unended.discard(reader.path)
 
 
 def _recorded(row: Row) -> Recorded:

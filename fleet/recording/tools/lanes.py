@@ -179,7 +179,7 @@ class Lanes:
 
 
 def _kept_by(safety: Any) -> str:
-    """Return in words what keeps a car from moving: an e-stop, the pause of the fleet, or a hold.
+    """Describe what keeps a car from moving: an e-stop, the pause of the fleet, or a hold.
 
     Empty if nothing does.
     """

@@ -119,4 +119,7 @@ class RecorderService:
         site = keys.recorder_site(self._fleet, key)
         if site is not None and site != self._site:
             with self._lock:
-                (self._others.add if came else self._others.discard)(site)
+                if came:
+                    self._others.add(site)
+                else:
+                    self._others.discard(site)

@@ -221,7 +221,7 @@ class SessionWriter:
 
     @property
     def drops(self) -> dict[str, int]:
-        """Return by key the messages lost to a full disk or queue, without those that a backfill restored."""
+        """Return the number of messages that a full disk or queue has cost, by key. Backfilled ones do not count."""
         counts = {key: self._drops.get(key, 0) + self._unrestored(key) for key in (*self._drops, *self._overflows)}
         return {key: count for key, count in counts.items() if count}
 
