@@ -181,7 +181,7 @@ class PlainStop:
 
 
 class PlainDriver(Driver):
-    """One car of a plain family, which sets the class attributes and defines the abstract methods."""
+    """One car of a plain family. The family's subclass sets the class attributes and defines the abstract methods."""
 
     STOP_FRAMES: ClassVar[int] = 1
     """Number of frames of a stop. Each try of a stop sends all of them."""
@@ -502,7 +502,7 @@ class PlainDriver(Driver):
                 return None
 
     def frames(self, what: Action) -> tuple[bytes | Later, ...]:
-        """Return the frames of an action on a part of the car. A change of speed has a placeholder."""
+        """Return the frames of an action on a part of the car."""
         if isinstance(what, ChangeSpeed):
             return (self.motion_frame(Motion.STOP),)  # a placeholder: when its turn comes, the present motion is sent
         return self.part_frames(what) or ()
@@ -573,7 +573,7 @@ class PlainDriver(Driver):
 
     def _give_way(self, stop: PlainStop, now: float, words: str = "") -> None:
         self._stop = None
-        words = words or f"{self._model.name} was commanded again before the stop was over, which was sent"
+        words = words or f"the stop was sent, and {self._model.name} was commanded again before it was over"
         for pending in stop.commands:
             if not isinstance(pending.command.what, SetMode):
                 self._log.record(pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)

@@ -291,7 +291,7 @@ class StopExecutor:
     def give_way(self, now: float) -> None:
         """End a stop that the car has not shown yet, because a new command replaces its repeats."""
         running, self.running = self.running, None
-        words = f"{self.model.name} was commanded again before its readings could show the stop, which was sent"
+        words = f"the stop was sent, and {self.model.name} was commanded again before its readings could show it"
         for pending in running.commands if running is not None else ():
             if not isinstance(pending.command.what, SetMode):
                 self._log.record(pending, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
