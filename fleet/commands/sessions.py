@@ -231,7 +231,8 @@ def _say_contents(about: "SessionSummary") -> None:
         echo_safely(f"  pinned: {times}: {pin.get('cause')}: {pin.get('words')}{f' ({cars})' if cars else ''}")
     for each in about.gone:
         times = f"{of_iso(each['from'])} to {of_iso(each['to'])}"
-        echo_safely(f"  removed by the quota: {times}, {each['file']}{', pinned' * bool(each.get('pinned'))}")
+        pinned = ", pinned" if each.get("pinned") else ""
+        echo_safely(f"  removed by the quota: {times}, {each['file']}{pinned}")
     shown = {key: printable(key) for key in about.keys}
     width = max(map(len, shown.values()), default=0)
     for key, count in about.keys.items():

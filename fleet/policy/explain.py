@@ -156,9 +156,9 @@ def _rules_against(car: str, known: CarSnapshot, role: Role, plan: Plan, phase: 
     """List the rules that could take the car out of this role."""
     rules = []
     for rule in plan.rules:
-        could = [effect for effect in rule.effects if _could_take(effect, rule, car, role, plan)]
-        if could and (rule.during is None or phase in rule.during):
-            own = rule.when.car == car or all(effect.who == THIS_CAR for effect in could)
+        effects = [effect for effect in rule.effects if _could_take(effect, rule, car, role, plan)]
+        if effects and (rule.during is None or phase in rule.during):
+            own = rule.when.car == car or all(effect.who == THIS_CAR for effect in effects)
             unseen = describe_unmeasured(rule.when.expression, [(known, role.mode)]) if own else ""
             rules.append(f"{rule.name}: {rule.when.text}{unseen}")
     return rules[:_MAX_REASONS]

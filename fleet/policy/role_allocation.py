@@ -22,7 +22,7 @@ REFUSED_MODE_RETRY_S: Final = 10.0
 _REFUSALS: Final = frozenset({Reason.BATTERY_LOW, Reason.UNSUPPORTED, Reason.LINK_DOWN, Reason.WRITE_FAILED})
 """Reasons that lie with the car itself. Holds and leases are known from its states."""
 _STAND_IN: Final = "/"
-"""Suffix of a role's name for those of its places that stand in for another role."""
+"""Suffix of a role's name. It marks the places of the role that stand in for another role."""
 _ROLE_LOSS_COST: Final = 1_000_000_000
 _MODE_CHANGE_COST: Final = 1_000_000
 _LINK_DOUBT_COST: Final = 10_000
@@ -79,7 +79,7 @@ class Candidates:
         name = role.name
         pinned = self.pinned.get(car)
         if pinned is not None and pinned.role != name:
-            return Barrier(f"{pinned.rule} leaves it {pinned.role} only", f"{pinned.rule} ends")
+            return Barrier(f"{pinned.rule} lets it have only role {pinned.role}", f"{pinned.rule} ends")
         if not self.plan.may(car, role):
             return Barrier("the plan does not give it to this car", "another plan is put in force")
         if role.by_rules and pinned is None and not any(name == other.if_none for other in self.plan.roles.values()):

@@ -39,7 +39,7 @@ _LINK_TIMEOUT_S: Final = 2.0
 """Time for which a question for tokens waits for a lost link. After 0.2 to 0.5 s a session has its link again."""
 _LINK_POLL_S: Final = 0.02
 _PROMPT_S: Final = 1.0
-"""Half the lease of a link. An answer that took longer may have ended with its link."""
+"""Half the lease of a link. If an answer takes longer, the link may have ended before it was whole."""
 _END_OF_LINK_S: Final = 0.1
 """Time within which a session notices that its link has ended."""
 
@@ -359,9 +359,14 @@ class Bus:
                 if self._is_twin(number, lambda: mark_of_query(declaration, query), TWIN_S):
                     with query:  # its other copy is answered
                         return
-                if words and too_large is None:
+                if not words:
+                    taken = callback(query)
+                elif too_large is not None:
+                    taken = too_large(query, words)
+                else:
                     refuse(query, words)
-                elif (too_large(query, words) if words and too_large is not None else callback(query)) is False:
+                    return
+                if taken is False:
                     refuse(query, BUSY)
 
             return session.declare_queryable(expression, on_query, complete=True)

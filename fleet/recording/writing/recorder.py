@@ -53,10 +53,10 @@ SUBSCRIBER_QUEUE_SIZE: Final = 16_384
 MAX_READ_BATCH: Final = 4_096
 """Maximum number of messages that are read from one subscription before the next one."""
 SHUTDOWN_DRAIN_S: Final = 0.3
-"""Wait at shutdown for messages in transit. It is also the timeout of the wait after it, for an answer of the hub."""
+"""At shutdown, wait this long for messages in transit, and then at most this long for an answer of the hub."""
 MAX_DRAIN_DELAY_S: Final = 0.2
-"""Maximum delay of both waits together, beyond SHUTDOWN_DRAIN_S. After a longer delay, the hub or the recorder stood
-still, and both waits are repeated."""
+"""If both waits together last longer than SHUTDOWN_DRAIN_S by more than this, the hub or the recorder stood still. Then
+both are repeated."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
@@ -188,8 +188,8 @@ class Recorder:
         )
 
     def _await_messages_in_transit(self) -> None:
-        end = began = time.monotonic()
-        end += MAX_SHUTDOWN_DRAIN_S
+        began = time.monotonic()
+        end = began + MAX_SHUTDOWN_DRAIN_S
         while began < end:
             time.sleep(SHUTDOWN_DRAIN_S)
             self._service.wait_for_hub(SHUTDOWN_DRAIN_S)
@@ -499,7 +499,8 @@ class Recorder:
         self._drain()
         self._end_session(self._session)
         self._recording = False
-        self._notify(f"{self._session.path} is closed by request{'; ' * bool(self._session.cost)}{self._session.cost}")
+        losses = f"; {self._session.cost}" if self._session.cost else ""
+        self._notify(f"{self._session.path} is closed by request{losses}")
         self._publish()
 
     def _mark(self, query: zenoh.Query) -> None:
@@ -510,7 +511,12 @@ class Recorder:
             text, by = request["text"], request.get("by", "anonymous")
         except (ValueError, KeyError, TypeError, AttributeError):
             raise _CommandRefused('A mark is JSON, such as {"text": "the cat came", "by": "me"}') from None
-        if not (isinstance(text, str) and isinstance(by, str) and 0 < len(text) <= MAX_MARK_CHARACTERS >= len(by)):
+        if not (
+            isinstance(text, str)
+            and isinstance(by, str)
+            and 0 < len(text) <= MAX_MARK_CHARACTERS
+            and len(by) <= MAX_MARK_CHARACTERS
+        ):
             raise _CommandRefused(
                 f"`text` must have 1 to {MAX_MARK_CHARACTERS} characters, `by` at most {MAX_MARK_CHARACTERS}"
             )
