@@ -1,19 +1,16 @@
 """Limits how often something may happen: in a burst, and per second in the long run. Pure."""
 
-from dataclasses import dataclass, field
 
-
-@dataclass(slots=True)
 class TokenBucket:
     """Grants bursts of up to `at_once`, and `per_s` in the long run. Times: s, monotonic."""
 
-    per_s: float
-    at_once: float
-    _left: float = field(init=False)
-    _at: float = float("-inf")
+    __slots__ = ("_at", "_left", "at_once", "per_s")
 
-    def __post_init__(self) -> None:
-        self._left = self.at_once
+    def __init__(self, per_s: float, at_once: float) -> None:
+        self.per_s = per_s
+        self.at_once = at_once
+        self._left = at_once
+        self._at = float("-inf")
 
     def has(self, now: float) -> bool:
         """Return True if one may pass now."""
