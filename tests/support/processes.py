@@ -135,9 +135,14 @@ class FleetProcesses:
         self.environment = {"FLEET_ENDPOINT": endpoint, "FLEET_STATE_DIR": str(directory / "state")}
         self._started: list[GatewayProcess] = []
         self._bus: bus.Bus | None = None
+        self.hub = self.start_hub()
+
+    def start_hub(self) -> GatewayProcess:
+        """Start a hub, and wait until it listens."""
         # On a busy machine, the first client may come later than a hub waits for one.
-        self.hub = self.start("-m", "schemas.bus.hub", "--endpoint", endpoint, "--idle-s", str(2 * PATIENCE_S))
-        wait_for(lambda: bus.accepts(endpoint), "the hub listens")
+        hub = self.start("-m", "schemas.bus.hub", "--endpoint", self.endpoint, "--idle-s", str(2 * PATIENCE_S))
+        wait_for(lambda: bus.accepts(self.endpoint), "the hub listens")
+        return hub
 
     def start(self, *arguments: str) -> GatewayProcess:
         """Start Python with these arguments."""
