@@ -39,6 +39,7 @@ from gateway.drivers import BUILT_IN, Family, built_in_platforms
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages
 from schemas.commands import COMMANDS
+from schemas.keys import NAME_RULE, is_name
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
 from schemas.platform_name import AUTO, normalize_name
 from schemas.rights import Sender
@@ -225,8 +226,10 @@ def _connected(family: Family, platform: str, samples: Sequence[bytes] = ()) -> 
 
 def check_names(family: Family, platform: str) -> Iterator[str]:
     """Check that a fleet file can name the platform, and that a wrong option is refused with a ValueError."""
-    if platform != normalize_name(platform) or "+" in platform or not platform:
-        yield f"{platform!r} cannot be named in a fleet file: write it in lower case, without +"
+    if platform != normalize_name(platform) or not is_name(platform):
+        yield f"{platform!r} cannot be named in a fleet file: use {NAME_RULE}"
+    if family.PLATFORMS.count(platform) > 1:
+        yield f"PLATFORMS has {platform} twice"
     if platform == AUTO or (
         platform in built_in_platforms() and getattr(family, "__name__", "") not in BUILT_IN.values()
     ):

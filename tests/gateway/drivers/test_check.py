@@ -12,6 +12,7 @@ import pytest
 
 from gateway.control.driver import Desk, Event
 from gateway.drivers import Family, check
+from gateway.drivers.plain_profile import PlainProfile
 from gateway.drivers.waveshare import family as waveshare
 from gateway.drivers.yahboom import family as yahboom
 from schemas.words import Basis, Motion
@@ -325,6 +326,20 @@ def test_careless_driver_fails_driver_check(driver: Any, fails: set[str]) -> Non
     found = {name: faults for _, name, faults in check.check(cast("Family", family)) if faults}
     assert bool(found) is bool(fails)
     assert found.keys() <= fails, found
+
+
+@pytest.mark.parametrize(
+    ("names", "fails"),
+    [(("tank",), False), (("small tank",), True), (("tänk",), True), (("t" * 33,), True), (("tank", "tank"), True)],
+)
+def test_platform_names_that_no_fleet_file_could_hold(names: tuple[str, ...], fails: bool) -> None:
+    def profile_of(name: str) -> PlainProfile:
+        if name not in names:
+            raise ValueError(name)
+        return replace(tank.PROFILE, name=name)
+
+    family = SimpleNamespace(PLATFORMS=names, profiles=lambda: tuple(map(profile_of, names)), profile_of=profile_of)
+    assert bool([*check.check_names(cast("Family", family), names[0])]) is fails
 
 
 @pytest.mark.parametrize(
