@@ -57,5 +57,5 @@ STOPPING = pb.Safety(motors="stopping")
         (judged((5.0, 8.0), STOPPING, complete_s=3.0), {}),
     ],
 )
-def test_a_false_claim_is_found(found: dict[str, int], expected: dict[str, int]) -> None:
+def test_false_claim_is_found(found: dict[str, int], expected: dict[str, int]) -> None:
     assert found == expected

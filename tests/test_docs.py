@@ -115,7 +115,7 @@ def navigation(part: Any) -> Iterator[str]:
             yield from (below,) if isinstance(below, str) else navigation(below)
 
 
-def test_the_navigation_is_complete() -> None:
+def test_navigation_is_complete() -> None:
     """Every page is in the navigation once. The pages of commands have an index of their own."""
     with (ROOT / "docs" / CONFIGURATION).open("rb") as file:
         found = Counter(navigation(tomllib.load(file)["project"]["nav"]))
@@ -155,7 +155,7 @@ def test_words_are_plain(page: Path) -> None:
 # The README.
 
 
-def test_the_readme_is_short_and_its_links_work_anywhere() -> None:
+def test_readme_is_short_and_its_links_work_anywhere() -> None:
     text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= README_LINES
     links = LINK.findall(FENCE.sub("", text)) + re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text))
@@ -178,7 +178,7 @@ def test_broken_page_or_heading_link_is_found() -> None:
     assert not faults_of("(docs/reference/protocol.md#framing).", "x")
 
 
-def test_the_changelog_says_nothing_twice() -> None:
+def test_changelog_says_nothing_twice() -> None:
     """Each heading and each line of a version stands once: two branches that were merged left a block twice."""
     lines = Counter(line for line in (ROOT / "CHANGELOG.md").read_text().splitlines() if line)
     assert [line for line, count in lines.items() if count > 1] == []

@@ -10,7 +10,7 @@ EXPECTED = expected()
 
 
 @pytest.mark.parametrize("page", EXPECTED, ids=lambda page: str(page.relative_to(ROOT)))
-def test_the_generated_pages_are_up_to_date(page: Path) -> None:
+def test_generated_pages_are_up_to_date(page: Path) -> None:
     assert page.read_text(encoding="utf-8") == EXPECTED[page], "run `make pages`"
 
 

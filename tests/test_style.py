@@ -24,7 +24,7 @@ def module_name(path: Path) -> str:
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-def test_a_class_name_stands_for_one_class() -> None:
+def test_class_name_stands_for_one_class() -> None:
     places: dict[str, list[str]] = defaultdict(list)
     for path in source_files(*PACKAGES):
         for node in nodes(path):
@@ -140,7 +140,7 @@ def messages_with_lines(path: Path) -> Iterator[tuple[int, str]]:
             yield node.lineno, node.value
 
 
-def test_a_message_to_users_has_at_most_two_lines() -> None:
+def test_message_to_users_has_at_most_two_lines() -> None:
     """Lists of a file's faults and changes are exempt, because no constant holds them."""
     raised = ("ClickException", "UsageError", "BadParameter", ".fail", ".echo", "stderr.write")
     faults = []

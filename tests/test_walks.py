@@ -61,7 +61,7 @@ def test_no_folder_has_more_than_twelve_floors_or_a_circle(imports: grimp.Import
 
 
 @pytest.mark.soak  # a traced gateway beside other tests is late, and its car shows nothing in time
-async def test_a_stop_passes_no_more_rooms_and_forms_than_before(tmp_path: Path, state: None) -> None:
+async def test_stop_passes_no_more_rooms_and_forms_than_before(tmp_path: Path, state: None) -> None:
     _, stop = await stop_walk(tmp_path)
     carrying = rooms(stop.carried)
     assert {"fleet/client/client.py", "gateway/bus/command_handler.py", "gateway/writer.py"} <= set(carrying)

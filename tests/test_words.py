@@ -158,7 +158,7 @@ def test_no_module_has_a_closed_word_as_a_literal() -> None:
         "PHASES = frozenset({'failed', 'rejected', 'expired'})",
     ],
 )
-def test_a_literal_word_is_found(code: str) -> None:
+def test_literal_word_is_found(code: str) -> None:
     tree = ast.parse(code)
     found = [
         each for node in ast.walk(tree) for each in (*((t.value) for n, t in held(node) if n in FIELDS), *lists(node))

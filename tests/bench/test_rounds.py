@@ -23,7 +23,7 @@ PROCESSES = {"cli", "commands", "fleet", "floods", "load", "readings", "secure"}
 @pytest.mark.parametrize(
     "name", [pytest.param(each, marks=[pytest.mark.soak] if each in PROCESSES else []) for each in BENCHMARKS]
 )
-def test_a_small_round(name: str) -> None:
+def test_small_round(name: str) -> None:
     rows: list[Measured] = importlib.import_module(f"tests.bench.{BENCHMARKS[name]}").run(SMALL)
     assert rows
     for row in rows:
@@ -36,12 +36,12 @@ def test_a_small_round(name: str) -> None:
     assert len({row.name for row in rows}) == len(rows), "two rows have one name"
 
 
-def test_the_command_knows_each_benchmark() -> None:
+def test_command_knows_each_benchmark() -> None:
     assert {path.stem for path in BENCH.glob("*.py")} - PARTS == {*BENCHMARKS.values()}
 
 
 @pytest.mark.parametrize(("announced_s", "met"), [(LONGEST_S, True), (LONGEST_S + 0.1, False)])
-def test_a_stop_without_a_floor_has_an_absolute_goal(announced_s: float, met: bool) -> None:
+def test_stop_without_a_floor_has_an_absolute_goal(announced_s: float, met: bool) -> None:
     row = measured(StopRow("at rest", 9, 0.0, 0.0, 0.0, announced_s, math.inf, 0.0, 0, math.inf, math.inf, ""))
     assert (row.ratio, row.to_dict()["ratio"], row.met) == (None, None, met)
     assert "inf" not in row_of(row)

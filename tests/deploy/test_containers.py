@@ -48,7 +48,7 @@ def test_no_service_has_a_right_that_it_does_not_need() -> None:
     assert f"FLEET_STATE_DIR={STATE}" in last
 
 
-def test_the_image_is_made_of_what_the_context_lets_through() -> None:
+def test_image_is_made_of_what_the_context_lets_through() -> None:
     ignored = (DEPLOY / "Containerfile.dockerignore").read_text(encoding="ascii").splitlines()
     let_through = {line[1:] for line in ignored if line.startswith("!")}
     build = (DEPLOY / "Containerfile").read_text(encoding="ascii").split("\nFROM ")[1]

@@ -24,7 +24,7 @@ FILES = sorted((EXAMPLES / "fleets").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_a_fleet_file_is_one(path: Path) -> None:
+def test_fleet_file_is_one(path: Path) -> None:
     fleet = read_fleet(path)
     assert len(fleet.cars) >= 3
     assert path.read_text().startswith(f"# yaml-language-server: $schema={SCHEMA}\n")
@@ -43,7 +43,7 @@ def test_there_is_one_for_each_start() -> None:
 
 
 @pytest.mark.parametrize("kind", SCHEMAS)
-def test_the_schema_is_up_to_date(kind: str) -> None:
+def test_schema_is_up_to_date(kind: str) -> None:
     assert (DEPLOY / f"{kind}.schema.json").read_text(encoding="utf-8") == schema_text(kind), (
         f"fleet schema {kind} > deploy/{kind}.schema.json"
     )
@@ -95,7 +95,7 @@ class _Unit(configparser.ConfigParser):
         return optionstr
 
 
-def test_the_unit_gives_cars_the_time_to_stop(tmp_path: Path) -> None:
+def test_unit_gives_cars_the_time_to_stop(tmp_path: Path) -> None:
     path = DEPLOY / "fleet.service"
     unit = _Unit(interpolation=None, delimiters=("=",))
     unit.read(path)

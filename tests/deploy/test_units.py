@@ -56,7 +56,7 @@ def test_each_has_the_time_that_its_end_takes() -> None:
         assert float(settings(name)["TimeoutStopSec"][0]) > seconds, name
 
 
-def test_the_hub_is_back_before_a_gateway_starts_another_one() -> None:
+def test_hub_is_back_before_a_gateway_starts_another_one() -> None:
     assert float(settings("car-hub.service")["RestartSec"][0]) < HUB_RESTART_DELAY_S
 
 

@@ -106,7 +106,7 @@ def test_drive_starts_at_once_and_is_described(cars: KindsUnderTest) -> None:
 
 
 @pytest.mark.xdist_group("any_car")
-def test_a_mode_opens_and_stays_and_a_stop_stops(cars: KindsUnderTest) -> None:
+def test_mode_opens_and_stays_and_a_stop_stops(cars: KindsUnderTest) -> None:
     with_modes = tuple(kind for kind in KINDS if kind.modes)
     for name, (code, outcome) in commands(cars, "mode", "tracking", kinds=with_modes).items():
         assert code == 0, (name, str(outcome))

@@ -102,7 +102,7 @@ def test_next_command_line_does_not_wait_for_lease(fleet: FleetProcesses) -> Non
         wait_for(lambda: not fleet.state("safety").HasField("lease"), "given back")
 
 
-def test_a_stop_with_a_broken_payload_stops(fleet: FleetProcesses) -> None:
+def test_stop_with_a_broken_payload_stops(fleet: FleetProcesses) -> None:
     sim, (red,) = fleet.simulate("red:arduino:tcp")
     fleet.gateway(red)
     fleet.ready()
@@ -116,7 +116,7 @@ def test_a_stop_with_a_broken_payload_stops(fleet: FleetProcesses) -> None:
     assert time.monotonic() - began < 8
 
 
-def test_a_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
+def test_lead_pauses_the_fleet_and_lends_a_car(fleet: FleetProcesses) -> None:
     sim, (red, blue) = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     table = ("--person", "teacher:lead", "--person", "ann", "--person", "bob:other")
     fleet.gateway(red, *table)

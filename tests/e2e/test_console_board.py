@@ -100,7 +100,7 @@ def test_class_joins_from_board_and_pupil_gets_car(stage: ConsoleStage) -> None:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", SIZES)
-def test_the_board_fits_each_screen(size: str, scheme: str, stage: ConsoleStage) -> None:
+def test_board_fits_each_screen(size: str, scheme: str, stage: ConsoleStage) -> None:
     width, height = SIZES[size]
     touch: dict[str, Any] = {"has_touch": True, "is_mobile": True} if size != "beamer" else {}
     page = stage.page("#/board", viewport={"width": width, "height": height}, color_scheme=scheme, **touch)

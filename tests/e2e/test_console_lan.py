@@ -37,7 +37,7 @@ def browser() -> Iterator[Browser]:
         opened.close()
 
 
-def test_a_phone_pairs_by_keyboard_drives_and_is_revoked(browser: Browser, tmp_path: Path) -> None:
+def test_phone_pairs_by_keyboard_drives_and_is_revoked(browser: Browser, tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         _, (link,) = fleet.simulate("red:arduino:tcp", truth=True)
@@ -125,7 +125,7 @@ def paired_page(browser: Browser, fleet: FleetProcesses, port: int, *person: str
     return page
 
 
-def test_a_group_and_a_teacher_share_one_console(browser: Browser, tmp_path: Path) -> None:
+def test_group_and_a_teacher_share_one_console(browser: Browser, tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         _, links = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp", truth=True)

@@ -103,7 +103,7 @@ def test_report_never_covers_pad_or_stop_on_phone(twenty_cars: ConsoleStage, scr
         assert pad["width"] * pad["height"] >= MIN_PAD_SHARE * 844 * 390
 
 
-def test_a_report_is_one_line_until_it_is_unfolded(stage: ConsoleStage) -> None:
+def test_report_is_one_line_until_it_is_unfolded(stage: ConsoleStage) -> None:
     page = stage.page("#/drive", **PORTRAIT)
     page.locator("#stop").tap()
     report = page.locator("[data-report]")
@@ -274,7 +274,7 @@ def contrast(one: tuple[int, ...], other: tuple[int, ...]) -> float:
     return (light + 0.05) / (dark + 0.05)
 
 
-def test_a_tile_says_that_its_car_moves(stage: ConsoleStage) -> None:
+def test_tile_says_that_its_car_moves(stage: ConsoleStage) -> None:
     page = stage.page()
     tile = page.locator("[data-car=red]")
     expect(tile).to_contain_text("standing")
@@ -292,7 +292,7 @@ def test_a_tile_says_that_its_car_moves(stage: ConsoleStage) -> None:
     stage.stands()
 
 
-def test_the_selection_outlives_a_reload_but_not_its_tab(stage: ConsoleStage) -> None:
+def test_selection_outlives_a_reload_but_not_its_tab(stage: ConsoleStage) -> None:
     page = stage.driving_page("red", "green")
     page.reload()
     for car, chosen in (("red", True), ("green", True), ("blue", False)):
@@ -309,7 +309,7 @@ def test_the_selection_outlives_a_reload_but_not_its_tab(stage: ConsoleStage) ->
     expect(other.locator("input[name=select-red]")).not_to_be_checked()
 
 
-def test_a_person_is_named_without_host_and_process(stage: ConsoleStage) -> None:
+def test_person_is_named_without_host_and_process(stage: ConsoleStage) -> None:
     page = stage.page()
     with Client(stage.fleet.endpoint, sender="teacher@vm-32639", kind="person") as teacher:
         for car in CARS:

@@ -67,7 +67,7 @@ def where(page: Page, car: str) -> tuple[float, float]:
     return float(found[1]), float(found[2])
 
 
-def test_a_simulated_car_is_drawn_where_it_truly_is(stage: ConsoleStage) -> None:
+def test_simulated_car_is_drawn_where_it_truly_is(stage: ConsoleStage) -> None:
     page = stage.page("#/map")
     expect(page.locator("[data-mark]")).to_have_count(3)
     expect(page.locator("[data-place=red]")).to_contain_text("simulated: true position")
@@ -112,7 +112,7 @@ def test_map_poses_have_own_floor_and_names_are_no_markup(stage: ConsoleStage) -
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("size", SIZES)
-def test_the_map_fits_each_screen_and_is_used_by_keyboard(size: str, scheme: str, stage: ConsoleStage) -> None:
+def test_map_fits_each_screen_and_is_used_by_keyboard(size: str, scheme: str, stage: ConsoleStage) -> None:
     width, height = SIZES[size]
     touch: dict[str, Any] = {"has_touch": True, "is_mobile": True} if size != "laptop" else {}
     page = stage.page("#/map", viewport={"width": width, "height": height}, color_scheme=scheme, **touch)
@@ -131,7 +131,7 @@ def test_the_map_fits_each_screen_and_is_used_by_keyboard(size: str, scheme: str
     expect(page.locator(f"[data-mark={focused}] .is-chosen")).to_be_visible()
 
 
-def test_the_map_of_a_moment_is_that_of_the_recording(stage: ConsoleStage, place: Path) -> None:
+def test_map_of_a_moment_is_that_of_the_recording(stage: ConsoleStage, place: Path) -> None:
     table = Session(place / OLD).to_pandas("sim/truth")
     at_ms = START_MS + 60_500
     page = stage.page(link("map", at_ms))

@@ -67,7 +67,7 @@ FIELDS = {"mode": "tracking", "count": 2, "needs": "battery_v > 7", "cars": ["re
         ("fixed: {blue: {mode: manual}}\nroles:\n  old: {mode: manual}", "fixed:"),
     ],
 )
-def test_a_form_writes_the_roles_and_leaves_the_rest(stage: ConsoleStage, before: str, rest: str) -> None:
+def test_form_writes_the_roles_and_leaves_the_rest(stage: ConsoleStage, before: str, rest: str) -> None:
     page = stage.page()
     roles = [["guide", FIELDS], ["yes", {"mode": "manual", "count": "all", "needs": ""}]]
     text = call(page, "plan-text", "withRoles", before, roles)
@@ -83,7 +83,7 @@ def test_a_form_writes_the_roles_and_leaves_the_rest(stage: ConsoleStage, before
     assert call(page, "plan-text", "withRoles", text, roles) == text, "written again it is the same"
 
 
-def test_an_example_is_changed_in_the_form_and_tried(stage: ConsoleStage) -> None:
+def test_example_is_changed_in_the_form_and_tried(stage: ConsoleStage) -> None:
     page = stage.page("#/plan")
     page.locator("select[name=example]").select_option(index=1)
     area = page.locator("textarea")

@@ -49,7 +49,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Room]:
     opened.close()
 
 
-def test_a_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
+def test_lead_pauses_takes_lends_and_all_pages_show_it(room: Room) -> None:
     expect.set_options(timeout=PATIENCE_S * 1000)
     teacher, ours, theirs = (room.page(person) for person in room.consoles)
     expect(teacher.get_by_text("You are teacher, a lead.")).to_be_visible()

@@ -77,7 +77,7 @@ def test_stop_report_changes_when_car_moves_again(stage: ConsoleStage) -> None:
     expect(report.get_by_role("status")).to_contain_text("1 moved since")
 
 
-def test_a_pause_is_named_a_pause(stage: ConsoleStage) -> None:
+def test_pause_is_named_a_pause(stage: ConsoleStage) -> None:
     page = stage.page()
     try:
         page.locator("#pause").click()
@@ -338,7 +338,7 @@ def test_times_are_of_console_not_browser_clock(stage: ConsoleStage) -> None:
     expect(page.locator("[data-plot='0'] .newest")).to_contain_text(re.compile(r"red [\d.]+"))
 
 
-def test_a_browser_with_a_wrong_clock_drives_and_stops(stage: ConsoleStage) -> None:
+def test_browser_with_a_wrong_clock_drives_and_stops(stage: ConsoleStage) -> None:
     page = stage.page("#/drive")
     page.add_init_script(WRONG_CLOCK)
     page.reload()
@@ -363,7 +363,7 @@ SEEN_ON = {"map": "[data-place=red]", "board": "[data-board=red]", "time": "[dat
 
 @pytest.mark.parametrize("how", ["wifi", "frozen"])
 @pytest.mark.parametrize("view", SEEN_ON)
-def test_a_page_that_was_cut_off_or_frozen_says_so_and_is_live_again(how: str, view: str, stage: ConsoleStage) -> None:
+def test_page_that_was_cut_off_or_frozen_says_so_and_is_live_again(how: str, view: str, stage: ConsoleStage) -> None:
     page = stage.page(f"#/{view}", wired=True)
     page.add_init_script(WRONG_CLOCK)
     page.reload()
@@ -396,7 +396,7 @@ def test_a_page_that_was_cut_off_or_frozen_says_so_and_is_live_again(how: str, v
     stage.stands()
 
 
-def test_a_car_that_does_not_stop_is_said_to_be_so_on_each_page(stage: ConsoleStage) -> None:
+def test_car_that_does_not_stop_is_said_to_be_so_on_each_page(stage: ConsoleStage) -> None:
     page = stage.page()
     stage.person.car("red").mode("tracking").check()
     wait_for(lambda: stage.judges["red"].driving, "red drives")

@@ -53,7 +53,7 @@ def show(page: Page, path: str) -> None:
 
 
 @pytest.mark.parametrize("screen", SCREENS)
-def test_a_page_fits_its_screen_and_its_last_button_is_in_reach_while_a_report_is_shown(
+def test_page_fits_its_screen_and_its_last_button_is_in_reach_while_a_report_is_shown(
     screen: str, stage: ConsoleStage
 ) -> None:
     page = stage.page(**SCREENS[screen])

@@ -44,7 +44,7 @@ def others(row: Locator) -> Locator:
     return row
 
 
-def test_the_page_records_marks_and_closes_what_it_started(stage: ConsoleStage, place: Path) -> None:
+def test_page_records_marks_and_closes_what_it_started(stage: ConsoleStage, place: Path) -> None:
     page = sessions_page(stage)
     page.locator("[data-recorder=recording]").wait_for()
     page.locator("input[name=mark]").fill("here it slips")

@@ -62,7 +62,7 @@ def test_setup_finds_car_blinks_and_keeps_comments(stage: ConsoleStage, file: Pa
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_the_stop_is_in_view_and_escape_stops(stage: ConsoleStage, size: str) -> None:
+def test_stop_is_in_view_and_escape_stops(stage: ConsoleStage, size: str) -> None:
     page = stage.phone("#/setup") if size == "phone" else stage.page("#/setup")
     page.locator("[data-setup=scan]").wait_for()
     assert serious(page) == []

@@ -106,7 +106,7 @@ def fill(message: Any) -> Any:
     return message
 
 
-def test_a_mark_and_the_name_of_a_recording_are_text(stage: ConsoleStage, page: Page, place: Path) -> None:
+def test_mark_and_the_name_of_a_recording_are_text(stage: ConsoleStage, page: Page, place: Path) -> None:
     page.goto(f"{stage.console.address}/#/sessions")
     page.locator("input[name=mark]").fill(WORDS)
     page.locator("[data-record=mark]").click()

@@ -92,7 +92,7 @@ def test_where_spans_are_and_what_they_say(stage: ConsoleStage) -> None:
     ]
 
 
-def test_a_link_shows_a_moment_on_every_page(stage: ConsoleStage) -> None:
+def test_link_shows_a_moment_on_every_page(stage: ConsoleStage) -> None:
     at_ms = START_MS + 4500  # the cars drive, and red is in mode manual
     page = stage.page(link("", at_ms))
     shown_at(page, at_ms)
@@ -195,7 +195,7 @@ def test_live_time_line_leads_back_and_to_running_session(stage: ConsoleStage) -
 
 
 @pytest.mark.parametrize("size", ["desktop", "phone"])
-def test_a_session_is_opened_scrubbed_by_hand_and_by_keys(stage: ConsoleStage, size: str) -> None:
+def test_session_is_opened_scrubbed_by_hand_and_by_keys(stage: ConsoleStage, size: str) -> None:
     page = stage.phone("#/sessions") if size == "phone" else stage.page("#/sessions")
     page.locator(f"[data-session='{OLD}'] .main").click()
     expect(page.locator("[data-past-at]")).to_have_count(1)
@@ -223,7 +223,7 @@ def test_a_session_is_opened_scrubbed_by_hand_and_by_keys(stage: ConsoleStage, s
     expect(page.locator("[data-past-at]")).to_have_count(0)
 
 
-def test_a_time_of_day_is_what_the_clock_of_the_console_says(stage: ConsoleStage) -> None:
+def test_time_of_day_is_what_the_clock_of_the_console_says(stage: ConsoleStage) -> None:
     page = stage.page()
     noon_ms, zone_s = 1_790_000_000_000 // 86_400_000 * 86_400_000 + 43_200_000, 3600  # 13:00 on that clock
     for text, reference_ms, s in (
@@ -257,7 +257,7 @@ def test_which_recording_covers_a_moment(stage: ConsoleStage) -> None:
     assert call(page, "spans", "recordingAt", [], "", 30_000, 5) is None
 
 
-def test_an_earlier_time_of_day_is_typed_and_what_nothing_covers_says_so(stage: ConsoleStage) -> None:
+def test_earlier_time_of_day_is_typed_and_what_nothing_covers_says_so(stage: ConsoleStage) -> None:
     page = stage.page("#/time")
     expect(page.locator("[data-since]")).to_contain_text("when the console started")
     wait_for(lambda: page.locator("[data-go=back10]").is_enabled(), "the running session is known")
@@ -307,7 +307,7 @@ def test_time_line_joins_repeated_presses_into_one_drive(stage: ConsoleStage) ->
 
 
 @pytest.mark.parametrize("view", ["", "map"])
-def test_a_jump_in_a_session_of_an_hour_is_fast(view: str, stage: ConsoleStage) -> None:
+def test_jump_in_a_session_of_an_hour_is_fast(view: str, stage: ConsoleStage) -> None:
     page = stage.page(link(view, START_MS + 1000))
     shown_at(page, START_MS + 1000)
     if view == "map":
@@ -333,7 +333,7 @@ def test_a_jump_in_a_session_of_an_hour_is_fast(view: str, stage: ConsoleStage) 
     assert took[-1] < MAX_JUMP_S
 
 
-def test_a_recording_that_is_not_there_says_so(stage: ConsoleStage) -> None:
+def test_recording_that_is_not_there_says_so(stage: ConsoleStage) -> None:
     page = stage.page("#/time?session=nothing&at=2026-01-01T00:00:00Z")
     expect(page.locator("[data-past-at]")).to_contain_text("There is no session 'nothing'.")
     page.locator("[data-live-now]").click()

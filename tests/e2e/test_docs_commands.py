@@ -297,7 +297,7 @@ def test_each_command_of_the_pages_on_made_sessions(prompt: Prompt) -> None:
     assert len(printed.getvalue().splitlines()) > 30
 
 
-def test_the_tables_name_no_command_that_is_gone() -> None:
+def test_tables_name_no_command_that_is_gone() -> None:
     every = {*LINES, *NOT_TYPED}
     for pattern in NOT_RUN:
         assert any(re.fullmatch(pattern, command) for command in every), pattern

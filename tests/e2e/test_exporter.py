@@ -31,7 +31,7 @@ def address_of(exporter: GatewayProcess) -> str:
     return str(found[0].split()[1])
 
 
-def test_a_car_is_scraped_with_what_it_does(tmp_path: Path) -> None:
+def test_car_is_scraped_with_what_it_does(tmp_path: Path) -> None:
     with secure_fleet(tmp_path, ANN, [car("red")]) as (fleet, store):
         _, (link,) = fleet.simulate("red:arduino:tcp")
         gateway = fleet.gateway(link)

@@ -7,7 +7,7 @@ from tests.support.flooding import FLIGHT_S, flood
 from tests.support.processes import FleetProcesses
 
 
-def test_a_flood_of_drives(fleet: FleetProcesses) -> None:
+def test_flood_of_drives(fleet: FleetProcesses) -> None:
     found = flood(fleet, seconds=2.0, stops=1)
     assert found.published > 10_000
     assert min(found.apart_s) > FLIGHT_S - 0.001, "the next frame waits until the last is no more in flight"

@@ -96,7 +96,7 @@ def serve(fleet: FleetProcesses) -> tuple[GatewayProcess, str]:
     return server, str(wait_for(server.lines, "it serves")[0].split()[1])
 
 
-def test_a_client_reads_a_car_live_with_its_schemas(tmp_path: Path) -> None:
+def test_client_reads_a_car_live_with_its_schemas(tmp_path: Path) -> None:
     async def look(address: str, fleet: FleetProcesses) -> None:
         async with foxglove_client(address) as client:
             battery = keys.topic_key("fleet", "red", "sensor/battery")

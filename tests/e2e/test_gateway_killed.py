@@ -72,7 +72,7 @@ def test_gateway_without_hub_stops_car(fleet: FleetProcesses, tmp_path: Path) ->
     assert "red was stopped" in successor.stderr
 
 
-def test_a_gateway_that_finds_neither_hub_nor_car_says_both(fleet: FleetProcesses) -> None:
+def test_gateway_that_finds_neither_hub_nor_car_says_both(fleet: FleetProcesses) -> None:
     alone = fleet.start(
         "-m", "gateway.cli", "run", "--car", "red", "--link", f"tcp://127.0.0.1:{free_port()}", "--platform",
         "arduino", "--connect", f"tcp/192.0.2.1:{free_port()}",

@@ -88,7 +88,7 @@ def lesson(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> Iterator[L
 
 
 @pytest.mark.soak
-def test_a_lesson_with_six_cars(lesson: Lesson) -> None:
+def test_lesson_with_six_cars(lesson: Lesson) -> None:
     # Each group drives its own cars. Everyone may stop all cars.
     lesson.hold_down("group_a", "red")
     words = lesson.refused("group_b", "drive", "red", "forward")
@@ -161,7 +161,7 @@ TUTORIAL = Path(__file__).parents[2] / "docs/tutorials/5-a-lesson-with-six-cars.
 
 @pytest.mark.soak
 @pytest.mark.timeout(400)
-def test_the_tutorial_word_for_word(tmp_path: Path) -> None:
+def test_tutorial_word_for_word(tmp_path: Path) -> None:
     """Each command does what the page says. Commands with `# refused` exit with 1."""
     programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     variables = {"PATH": programs, "FLEET_ENDPOINT": free_endpoint(), "FLEET_STATE_DIR": str(tmp_path / "state")}

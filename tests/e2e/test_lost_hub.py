@@ -101,7 +101,7 @@ def test_without_a_hub_no_command_says_that_nothing_is_running(fleet: FleetProce
     assert "gateways run here (red): cars may move" in done.stderr
 
 
-def test_a_mark_ends_with_its_gateway_however_that_ends(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mark_ends_with_its_gateway_however_that_ends(fleet: FleetProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", fleet.environment["FLEET_STATE_DIR"])
     _, links = fleet.simulate("red:arduino:tcp", "blue:arduino:tcp")
     red, blue = (fleet.gateway(link, car=car) for link, car in zip(links, ("red", "blue"), strict=True))

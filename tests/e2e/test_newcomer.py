@@ -136,7 +136,7 @@ def until(of: list[Block], word: str) -> tuple[list[Block], list[Block]]:
 
 
 @pytest.mark.timeout(600)
-def test_the_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
+def test_readme_and_the_tutorials_word_for_word(tmp_path: Path) -> None:
     """The commands run from the wheel with all its extras, outside the clone."""
     here = Environment(tmp_path)
     for extra in ("view", "ble", "analysis"):

@@ -10,7 +10,7 @@ from tests.support.processes import FleetProcesses
 
 
 @pytest.mark.soak
-def test_a_killed_operator_stops_its_car(fleet: FleetProcesses) -> None:
+def test_killed_operator_stops_its_car(fleet: FleetProcesses) -> None:
     took = kill_operators(fleet)
     late = {case: found for case, found in took.items() if found.took_s > found.limit_s + BUSY_S}
     assert not late, late

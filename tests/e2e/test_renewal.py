@@ -52,7 +52,7 @@ def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FleetPro
         yield made
 
 
-def test_a_drive_goes_on_while_both_are_renewed_and_their_first_certificates_end(
+def test_drive_goes_on_while_both_are_renewed_and_their_first_certificates_end(
     secured: tuple[FleetProcesses, HubStore],
 ) -> None:
     """Zenoh closes a link when its certificate ends: a session that had not moved would lose its tokens then."""
@@ -88,7 +88,7 @@ def test_a_drive_goes_on_while_both_are_renewed_and_their_first_certificates_end
     } == {}
 
 
-def test_a_command_alone_renews_too(secured: tuple[FleetProcesses, HubStore]) -> None:
+def test_command_alone_renews_too(secured: tuple[FleetProcesses, HubStore]) -> None:
     """On the computer of a person, often only commands run. The key stays, the common name, too."""
     _, store = secured
     age(store, MIA, DUE)

@@ -125,7 +125,7 @@ def test_failing_driver_leaves_no_moving_car(fleet: FleetProcesses, tmp_path: Pa
         tank.close()
 
 
-def test_a_car_of_another_package_is_named_driven_and_stopped(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_car_of_another_package_is_named_driven_and_stopped(fleet: FleetProcesses, tmp_path: Path) -> None:
     install_tank(fleet, tmp_path, "tests.support.tank")
     tank = TankServer()
     try:

@@ -40,7 +40,7 @@ def proposed(text: str) -> list[list[str]]:
     return [shlex.split(words) for words in re.findall(r"`fleet ([^`]*)`", text)]
 
 
-def test_a_stop_reaches_both_and_nothing_else_is_guessed(environment: dict[str, str]) -> None:
+def test_stop_reaches_both_and_nothing_else_is_guessed(environment: dict[str, str]) -> None:
     run = partial(fleet_command, environment=environment)
     with Bus.open(environment["FLEET_ENDPOINT"]) as bus:
 
@@ -71,7 +71,7 @@ def test_a_stop_reaches_both_and_nothing_else_is_guessed(environment: dict[str, 
         wait_for(lambda: not safety("fleet").estops and not safety("two").estops, "both are released")
 
 
-def test_a_car_that_only_one_fleet_has_needs_no_name(environment: dict[str, str]) -> None:
+def test_car_that_only_one_fleet_has_needs_no_name(environment: dict[str, str]) -> None:
     run = partial(fleet_command, environment=environment)
     assert run("stop", "blue").returncode == 1, "no fleet has it"
     assert run("mode", "green", "manual").returncode == 0

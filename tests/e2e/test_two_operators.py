@@ -170,7 +170,7 @@ def test_moving_car_can_be_taken_over_with_take(
     assert "by bob" in words
 
 
-def test_a_person_takes_the_car_from_a_script_with_a_lease(fleet: FleetProcesses, sim: GatewayProcess) -> None:
+def test_person_takes_the_car_from_a_script_with_a_lease(fleet: FleetProcesses, sim: GatewayProcess) -> None:
     record = Record(fleet)
     script = fleet.start("-c", SCRIPT)
     wait_for(lambda: is_driver(fleet, "bot"), "the script drives")

@@ -147,7 +147,7 @@ def test_one_that_sleeps_itself_blames_nobody(up: Up) -> None:
     assert {each.name: up.running(each.name) for each in up.processes()} == before
 
 
-def test_a_second_one_refuses_and_names_the_first(up: Up) -> None:
+def test_second_one_refuses_and_names_the_first(up: Up) -> None:
     for more in ((), ("--detach",)):
         second = up.fleet("up", "--sim", "1", "--no-record", *more)
         assert second.returncode == 1
@@ -178,7 +178,7 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
     assert " mean green?" in wrong.stderr
 
 
-def test_a_command_that_is_none_is_refused(up: Up) -> None:
+def test_command_that_is_none_is_refused(up: Up) -> None:
     for verb, payload, words in (("up", "{}", "There are down, reload"), ("down", "{", "is not the JSON")):
         selector = f"fleet/@supervisor/@cmd/{verb}?format=json"
         (answer,) = up.bus.query(selector, payload=payload.encode(), timeout_s=PATIENCE_S)

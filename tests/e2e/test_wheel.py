@@ -98,7 +98,7 @@ class Environment:
 
 
 @pytest.mark.timeout(240)
-def test_the_first_minutes_from_the_wheel(tmp_path: Path) -> None:
+def test_first_minutes_from_the_wheel(tmp_path: Path) -> None:
     here = Environment(tmp_path)
     extras = ("rerun", "pyarrow", "numpy", "PIL", "bleak", "uvicorn", "starlette")
     hidden = f"for module in {extras}: assert not find_spec(module), module"

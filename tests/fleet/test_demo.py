@@ -53,7 +53,7 @@ def test_terminated_demo_stops_cars_and_leaves_nothing(tmp_path: Path) -> None:
     wait_for(lambda: not _left(str(tmp_path)), "everything has ended")
 
 
-def test_a_directory_that_cannot_be_made_is_one_line() -> None:
+def test_directory_that_cannot_be_made_is_one_line() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "fleet.cli", "demo", "--sessions", "/proc/x"],
         capture_output=True,

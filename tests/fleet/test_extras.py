@@ -69,7 +69,7 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("command", EXPECTED)
-def test_a_command_works_or_says_what_to_type(command: str, outcomes: dict[str, Any]) -> None:
+def test_command_works_or_says_what_to_type(command: str, outcomes: dict[str, Any]) -> None:
     code, said = EXPECTED[command]
     returncode, stdout, stderr = outcomes[command]
     assert returncode == code, (stdout, stderr)

@@ -15,19 +15,19 @@ SIZES = st.one_of(st.just(0), st.integers(MB, 10**15))
     ("text", "size"),
     [("20GB", 20 * 10**9), ("1 mb", MB), ("1.5GB", 1_500 * MB), ("7", 7), ("7B", 7), ("1e6", None), ("GB", None)],
 )
-def test_a_size_is_read(text: str, size: int | None) -> None:
+def test_size_is_read(text: str, size: int | None) -> None:
     assert parse_size(text) == size
 
 
 @pytest.mark.parametrize(
     ("size", "text"), [(20 * 10**9, "20GB"), (1_500 * MB, "1500MB"), (10**15, "1000TB"), (1_000_001, "1000001B")]
 )
-def test_a_size_is_written_with_its_largest_whole_unit(size: int, text: str) -> None:
+def test_size_is_written_with_its_largest_whole_unit(size: int, text: str) -> None:
     assert format_size(size) == text
 
 
 @given(total=SIZES, session=SIZES)
-def test_the_recorder_gets_each_limit_as_it_was(total: int, session: int) -> None:
+def test_recorder_gets_each_limit_as_it_was(total: int, session: int) -> None:
     options = record.run.make_context("run", list(Quota(total, session).arguments)).params
     assert (options["quota"] or 0, options["session_size"] or 0) == (total, session)
 

@@ -54,7 +54,7 @@ async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(
         assert not shown, "one block gap is no evidence"
 
 
-async def test_a_line_of_text_is_no_reading_and_no_damage(fleet: FleetProcesses, car: TcpCar, tmp_path: Path) -> None:
+async def test_line_of_text_is_no_reading_and_no_damage(fleet: FleetProcesses, car: TcpCar, tmp_path: Path) -> None:
     verdicts: list[str] = []
     links: list[Any] = []
 

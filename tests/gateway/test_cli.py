@@ -11,7 +11,7 @@ from gateway.cli import COMMANDS, main
 from tests.gateway.conftest import Command
 
 
-def test_the_help_names_every_command(command: Command) -> None:
+def test_help_names_every_command(command: Command) -> None:
     done = command("--help")
     assert done.returncode == 0
     for name, (_, words) in COMMANDS.items():
@@ -20,7 +20,7 @@ def test_the_help_names_every_command(command: Command) -> None:
 
 @pytest.mark.parametrize("unbuffered", [False, True])
 @pytest.mark.parametrize("words", ["--help", "run --help", "scan --help", "--version"])
-def test_a_help_that_cannot_be_written_fails(
+def test_help_that_cannot_be_written_fails(
     words: str, unbuffered: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A buffered write fails at the end. An unbuffered write (`python -u`) fails at once, with only one error."""
@@ -78,7 +78,7 @@ def test_wrong_words_name_the_likely_one(command: Command, arguments: str, words
         ("--battery-low-v", "nan", "0 < critical <= low <= 30 V"),
     ],
 )
-def test_a_limit_out_of_range_is_told_with_the_range(command: Command, option: str, value: str, allowed: str) -> None:
+def test_limit_out_of_range_is_told_with_the_range(command: Command, option: str, value: str, allowed: str) -> None:
     done = command("run", "--car", "red", "--link", "tcp://127.0.0.1:9", option, value)
     assert done.returncode == 2
     assert option in done.stderr

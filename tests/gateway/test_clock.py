@@ -33,7 +33,7 @@ def _wall(takes: Callable[[int], int] = lambda look: 50) -> tuple[Clocks, WallCl
     return clocks, WallClock(clocks.monotonic_ns, clocks.wall_ns)
 
 
-def test_a_moment_has_its_wall_time() -> None:
+def test_moment_has_its_wall_time() -> None:
     clocks, wall = _wall()
     assert wall.ns(clocks.now / 1e9) == pytest.approx(clocks.now + EPOCH_NS, abs=1_000)
     assert wall.ns(4.0) == pytest.approx(4_000 * MS + EPOCH_NS, abs=1_000)
@@ -56,14 +56,14 @@ def test_always_stalled_process_has_bounded_clock_error() -> None:
 
 
 @pytest.mark.parametrize("step", [-3_600_000 * MS, -3 * MS, 3 * MS, 3_600_000 * MS])
-def test_a_wall_clock_that_is_set_is_followed_at_once(step: int) -> None:
+def test_wall_clock_that_is_set_is_followed_at_once(step: int) -> None:
     clocks, wall = _wall()
     before = wall.ns(4.0)
     clocks.ahead += step
     assert wall.ns(4.0) - before == pytest.approx(step, abs=1_000)
 
 
-def test_a_slewed_wall_clock_is_followed_in_steps() -> None:
+def test_slewed_wall_clock_is_followed_in_steps() -> None:
     clocks, wall = _wall()
     stamps = []
     for _ in range(1_000):  # 10 us at a time, 10 ms in all

@@ -65,7 +65,7 @@ async def test_car_that_drove_through_sleep_is_stopped_first(tmp_path: Path) -> 
         assert RUN not in car.received[before:]
 
 
-async def test_a_sleep_is_noticed_without_any_command_or_reading(tmp_path: Path) -> None:
+async def test_sleep_is_noticed_without_any_command_or_reading(tmp_path: Path) -> None:
     computer = SleepingLaptop()
     async with standing(tmp_path, computer) as (_, _, codes):
         computer.slept_s += 60.0
@@ -73,7 +73,7 @@ async def test_a_sleep_is_noticed_without_any_command_or_reading(tmp_path: Path)
         assert codes.count("slept") == 1
 
 
-async def test_the_true_motors_stop_after_a_sleep_and_stay_off(tmp_path: Path) -> None:
+async def test_true_motors_stop_after_a_sleep_and_stay_off(tmp_path: Path) -> None:
     """The car does not sleep: it drives on meanwhile."""
     laptop = SleepingLaptop()
     fleet = FleetProcesses(free_endpoint(), tmp_path)

@@ -8,7 +8,7 @@ from schemas.atomic_file import write_atomically
 
 
 @pytest.mark.parametrize("sync", [False, True])
-def test_a_file_is_replaced_and_keeps_its_mode(tmp_path: Path, sync: bool) -> None:
+def test_file_is_replaced_and_keeps_its_mode(tmp_path: Path, sync: bool) -> None:
     path = tmp_path / "state.json"
     write_atomically(path, b"old", sync=sync)
     path.chmod(0o600)

@@ -3,7 +3,7 @@
 from schemas.colors import COLORS, car_color, format_color, hex_color, parse_color
 
 
-def test_a_color_is_read_as_it_is_written() -> None:
+def test_color_is_read_as_it_is_written() -> None:
     assert [format_color(parse_color(text)) for text in ("red", "#ff8000", "ff8000")] == ["red", "#ff8000", "#ff8000"]
 
 

@@ -81,7 +81,7 @@ def test_invalid_identity_speaks_for_nobody(identity: str, sender: str, kind: Ra
         (service(Service.CONSOLE), MIA, MIA),
     ],
 )
-def test_a_service_knows_who_asks(identity: str, sender: str, expected: str) -> None:
+def test_service_knows_who_asks(identity: str, sender: str, expected: str) -> None:
     assert sender_for(identity, sender, "plan") == expected
 
 

@@ -17,7 +17,7 @@ def test_refused_names_say_the_rule(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "likely"), [("Red", "red"), ("my car", "my_car"), ("red ", "red")])
-def test_a_refused_name_names_the_likely_one(name: str, likely: str) -> None:
+def test_refused_name_names_the_likely_one(name: str, likely: str) -> None:
     with pytest.raises(keys.BadKey, match=rf"digit\. Did you mean {likely}\?$"):
         keys.check_name(name)
 
@@ -50,14 +50,14 @@ def test_bad_expressions_say_what_is_allowed(bad: str) -> None:
         keys.expand(bad)
 
 
-def test_a_key_is_taken_apart_and_put_together() -> None:
+def test_key_is_taken_apart_and_put_together() -> None:
     key = keys.parse("fleet/red/sensor/range")
     assert key == keys.Key("fleet", "red", "sensor/range")
     assert str(key) == "fleet/red/sensor/range"
     assert keys.parse("fleet") is None
 
 
-def test_the_topic_of_a_key() -> None:
+def test_topic_of_a_key() -> None:
     assert topics.of_key("fleet/red/sensor/range") is topics.TOPICS["sensor/range"]
     assert topics.of_key("fleet/@recorder/status") is topics.TOPICS["@recorder/status"]
     assert topics.of_key("fleet/red/sensor/none") is None
@@ -74,5 +74,5 @@ def test_the_topic_of_a_key() -> None:
         ("", ""),
     ],
 )
-def test_a_sender_is_called_by_its_name(sender: str, name: str) -> None:
+def test_sender_is_called_by_its_name(sender: str, name: str) -> None:
     assert keys.name_of(sender) == name

@@ -18,7 +18,7 @@ AT_NS = 1_773_501_377_123_456_789
         ("NST3:30", "2026-03-14 11:46:17.123 NST", "2026-03-14T11:46:17.123-03:30"),
     ],
 )
-def test_an_exact_time_is_local_and_can_be_typed_again(where: str, date: str, offset: str) -> None:
+def test_exact_time_is_local_and_can_be_typed_again(where: str, date: str, offset: str) -> None:
     with zone(where):
         assert local_time.exact(AT_NS) == date
         assert local_time.with_offset(AT_NS) == offset
@@ -26,11 +26,11 @@ def test_an_exact_time_is_local_and_can_be_typed_again(where: str, date: str, of
 
 
 @pytest.mark.parametrize("text", ["", "yesterday", "2026-03-14T15:16:17"])
-def test_a_stored_text_without_a_zone_is_not_converted(text: str) -> None:
+def test_stored_text_without_a_zone_is_not_converted(text: str) -> None:
     assert local_time.of_iso(text) == text
 
 
-def test_a_stored_time_is_told_in_the_local_zone() -> None:
+def test_stored_time_is_told_in_the_local_zone() -> None:
     with zone("CET-1"):
         assert local_time.of_iso("2026-03-14T15:16:17.123Z") == "2026-03-14 16:16:17 CET"
 

@@ -135,7 +135,7 @@ def test_each_command_is_carried_out_once_and_answered_once(endpoint: str) -> No
         assert sum(1 for each in carried_out if each != b"first") == sent
 
 
-def test_a_token_lasts_and_a_watcher_hears_of_no_change(endpoint: str) -> None:
+def test_token_lasts_and_a_watcher_hears_of_no_change(endpoint: str) -> None:
     with Bus.open(endpoint) as car, Bus.open(endpoint) as watcher:
         came: list[tuple[str, bool]] = []
         car.token("fleet/red")
@@ -182,7 +182,7 @@ def test_without_a_hub_the_first_session_goes_on(
         assert car.id == before
 
 
-def test_a_twin_is_counted_and_the_older_session_is_deaf_in_the_end() -> None:
+def test_twin_is_counted_and_the_older_session_is_deaf_in_the_end() -> None:
     found = Overlap()
     assert [found.is_twin("a", 1.0, newer=side) for side in (False, False, True, True, True)] == [
         False,

@@ -9,7 +9,7 @@ from schemas.bus import DEFAULT_ENDPOINT
 from schemas.state_dir import default_directory, directory_of
 
 
-def test_the_directory_is_the_variables_or_the_platforms(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_directory_is_the_variables_or_the_platforms(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path / "chosen"))
     assert default_directory() == tmp_path / "chosen"
     monkeypatch.delenv("FLEET_STATE_DIR")

@@ -34,10 +34,10 @@ def test_only_real_neighbors_are_near(wrong: str, names: list[str], near: list[s
     assert near_names(wrong, names) == near
 
 
-def test_the_likeliest_name_comes_first() -> None:
+def test_likeliest_name_comes_first() -> None:
     assert did_you_mean("rang", ["ranges", "range"], 2) == "Did you mean range or ranges?"
 
 
-def test_a_beginning_is_no_misspelling() -> None:
+def test_beginning_is_no_misspelling() -> None:
     assert misspelled("other", ["other_cars"]) == []
     assert misspelled("other_car", ["other_cars"]) == ["other_cars"]

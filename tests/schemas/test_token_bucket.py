@@ -18,7 +18,7 @@ def test_little_by_little_nothing_is_lost() -> None:
     assert sum(allowance.take(1, number / 100) for number in range(1000)) == 1000
 
 
-def test_a_clock_that_goes_back_gives_nothing() -> None:
+def test_clock_that_goes_back_gives_nothing() -> None:
     allowance = TokenBucket(per_s=100, at_once=100)
     assert allowance.take(100, 5.0) == 100
     assert allowance.take(100, 4.0) == 0

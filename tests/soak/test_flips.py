@@ -64,7 +64,7 @@ def flipped(case: tuple[int, float]) -> FlippedStops:
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("share", SHARES)
-def test_a_false_claim_by_a_changed_bit_is_noticed(share: float) -> None:
+def test_false_claim_by_a_changed_bit_is_noticed(share: float) -> None:
     with ProcessPoolExecutor(2) as pool:
         stops = list(pool.map(flipped, [(seed, share) for seed in range(FIRST, BEHIND)], chunksize=50))
     shown, false_s = sum(each.complete for each in stops), sorted(one for each in stops for one in each.false_s)

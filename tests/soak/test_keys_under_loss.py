@@ -68,7 +68,7 @@ LOSSES: dict[str, Callable[[FleetProcesses, Recording, random.Random], None]] = 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("loss", LOSSES)
-def test_a_key_is_what_was_published(loss: str, tmp_path: Path) -> None:
+def test_key_is_what_was_published(loss: str, tmp_path: Path) -> None:
     chance, over, sent = random.Random(loss), threading.Event(), set[str]()
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     threads = [threading.Thread(target=publish, args=(fleet.endpoint, each, over, sent)) for each in SENDERS]

@@ -75,7 +75,7 @@ def test_cut_links(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-def test_a_minute_of_10000_drives_a_second(tmp_path: Path) -> None:
+def test_minute_of_10000_drives_a_second(tmp_path: Path) -> None:
     for fleet in fleets(tmp_path, 1):
         found = flood(fleet, seconds=60.0, stops=12)
     print(
@@ -106,7 +106,7 @@ def test_five_stops_in_every_mode(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-def test_a_coordinator_never_moves_a_stopped_car(tmp_path: Path) -> None:
+def test_coordinator_never_moves_a_stopped_car(tmp_path: Path) -> None:
     killed = ["gateway", "coordinator", "gateway and coordinator"] * 4
     for fleet in fleets(tmp_path, 1):
         assert want_for_ever(fleet, tmp_path, killed) == []

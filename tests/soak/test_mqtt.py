@@ -129,7 +129,7 @@ def kept(broker: Mosquitto) -> dict[str, bytes]:
         new.close()
 
 
-def test_a_car_comes_acts_and_goes(tmp_path: Path, broker: Mosquitto, reader: MqttReader) -> None:
+def test_car_comes_acts_and_goes(tmp_path: Path, broker: Mosquitto, reader: MqttReader) -> None:
     with secure_fleet(tmp_path, ANN, [car("red")]) as (fleet, store):
         refused = bridge(fleet, broker, "wrong")
         assert refused.wait() == 1

@@ -27,7 +27,7 @@ JSON = zenoh.Encoding("application/octet-stream")
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(3))
-def test_a_quota_that_holds_a_tenth_loses_no_pinned_minute(seed: int, tmp_path: Path) -> None:
+def test_quota_that_holds_a_tenth_loses_no_pinned_minute(seed: int, tmp_path: Path) -> None:
     rng = random.Random(seed)
     options = Options(segment_s=QUOTA_SEGMENT_S, quota=Quota(QUOTA))
     pinned = sorted(rng.sample(range(60, HOURS * 3600 - 60, 40), PINS))

@@ -28,7 +28,7 @@ GROWN = 1.1
 
 
 @pytest.mark.soak
-def test_the_hub_killed_twenty_times(tmp_path: Path) -> None:
+def test_hub_killed_twenty_times(tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         told = hub_killed(fleet, tmp_path / "sessions", cars=CARS, times=20, chance=random.Random())
@@ -58,7 +58,7 @@ def test_backfill_recovers_after_any_hub_outage(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak
-def test_the_recorder_killed_fifty_times(tmp_path: Path) -> None:
+def test_recorder_killed_fifty_times(tmp_path: Path) -> None:
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:
         told = recorder_killed(fleet, tmp_path / "sessions", cars=CARS, times=50, chance=random.Random())

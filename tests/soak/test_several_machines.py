@@ -88,7 +88,7 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NetworkStage]:
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("seed", range(ROUNDS))
-def test_an_operator_that_is_cut_off_stops_both(seed: int, stage: NetworkStage) -> None:
+def test_operator_that_is_cut_off_stops_both(seed: int, stage: NetworkStage) -> None:
     driver = stage.drive()
     stage.made.cut(OPERATOR)
     began = time.monotonic()

@@ -15,7 +15,7 @@ MOMENTS = 200
 
 
 @pytest.mark.soak
-def test_the_distribution_of_stops() -> None:
+def test_distribution_of_stops() -> None:
     table = distribution(MOMENTS)
     head = f"{'state':48} {'stops':>6} {'p50':>6} {'p90':>6} {'worst':>6} {'announced':>9} {'ratio':>6}  worst seen in"
     print(f"\n{head}")

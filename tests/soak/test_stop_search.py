@@ -27,7 +27,7 @@ def test_thirty_thousand_episodes() -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("rule", RULES)
-def test_the_search_finds_what_each_rule_prevents(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_finds_what_each_rule_prevents(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     RULES[rule](monkeypatch.setattr)
     first = RARE.get(rule, 0)
     found = found_at(range(first, first + WITHIN))

@@ -63,7 +63,7 @@ def sites(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TwoSites]:
 @pytest.mark.soak
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("number", range(ROUNDS))
-def test_a_partition_with_a_person_on_each_side(number: int, sites: TwoSites) -> None:
+def test_partition_with_a_person_on_each_side(number: int, sites: TwoSites) -> None:
     own = sites.drive(PI, "blue")
     across = sites.drive(PI, "red")
     sites.made.cut(PI)

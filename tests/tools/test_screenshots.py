@@ -32,7 +32,7 @@ def read(path: Path) -> np.ndarray:
 
 
 @pytest.mark.timeout(300)
-def test_the_pictures_show_the_fleet_a_car_and_the_world(tmp_path: Path) -> None:
+def test_pictures_show_the_fleet_a_car_and_the_world(tmp_path: Path) -> None:
     session = tmp_path / "0001.mcap"
     make(session)
     if software_driver() is None:

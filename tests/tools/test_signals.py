@@ -22,6 +22,6 @@ print(child.returncode)
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
-def test_a_process_ends_by_a_signal_that_its_starter_ignores(number: signal.Signals) -> None:
+def test_process_ends_by_a_signal_that_its_starter_ignores(number: signal.Signals) -> None:
     done = subprocess.run([sys.executable, "-c", RUNNER, str(int(number))], capture_output=True, text=True, check=True)
     assert int(done.stdout) == -number

@@ -45,7 +45,7 @@ def test_stress_resumes_paused_processes(sleepers: list[psutil.Process]) -> None
     assert pauses.processes == {sleepers[0].pid}
 
 
-def test_a_gateway_is_paused_for_less_than_a_stall() -> None:
+def test_gateway_is_paused_for_less_than_a_stall() -> None:
     words = [sys.executable, "-c", "import time; time.sleep(600)", "gateway.cli", "run"]
     with subprocess.Popen(words) as process:
         pauses = Pauses(random.Random(1), lambda: [psutil.Process(process.pid)])

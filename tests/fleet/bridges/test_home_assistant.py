@@ -79,7 +79,7 @@ def test_only_what_was_measured_has_a_value() -> None:
     assert values(plan.news({"red": odd}, 9.0))["distance_m"] is None
 
 
-def test_a_car_that_is_lost_silent_or_gone_is_offline() -> None:
+def test_car_that_is_lost_silent_or_gone_is_offline() -> None:
     plan = HomeAssistant("fleet")
     red = car()
     plan_topics = f"{RED}/availability"

@@ -16,7 +16,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 SHOWN = pb.Safety(motors="off", motors_basis="shown", trust_evidence="2 gaps", trust_since_s=3.0)
 
 
-def test_a_claim_has_its_basis_its_time_and_its_age() -> None:
+def test_claim_has_its_basis_its_time_and_its_age() -> None:
     claim = motors_claim(SHOWN, 0.5)
     assert (claim.what, claim.basis, claim.since_s, claim.age_s) == ("off", "shown", 3.5, 0.5)
     assert claim.short == "off (shown)"
@@ -30,7 +30,7 @@ def test_a_claim_has_its_basis_its_time_and_its_age() -> None:
     assert motors_claim(pb.Safety(motors="on")).short == "on"
 
 
-def test_an_old_claim_tells_its_age() -> None:
+def test_old_claim_tells_its_age() -> None:
     assert motors_claim(SHOWN, 60.0).short == "off (shown, 60 s old)"
     assert link_claim(pb.Link(state="online"), 300.0).short == "online (5 min old)"
 

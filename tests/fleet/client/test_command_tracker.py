@@ -120,7 +120,7 @@ def reading(topic: str, seq: int, age_s: float, boot: str = "a", **fields: Any) 
         ([(3, 0.0), (1, 2.0)], 1.0, 0.0),  # in any order
     ],
 )
-def test_a_rate_is_counted_by_the_publishers_numbers(
+def test_rate_is_counted_by_the_publishers_numbers(
     seen: list[tuple[int, float]], rate: float | None, age_s: float
 ) -> None:
     survey = KeySurvey(2.5)
@@ -130,7 +130,7 @@ def test_a_rate_is_counted_by_the_publishers_numbers(
     assert (found.rate_hz, found.age_s) == (rate, age_s)
 
 
-def test_a_publisher_that_began_anew_counts_anew() -> None:
+def test_publisher_that_began_anew_counts_anew() -> None:
     survey = KeySurvey(2.5)
     for seq, age, boot in ((900, 2.0, "a"), (1, 1.0, "b"), (2, 0.0, "b")):
         survey.add(reading("sensor/range", seq, age, boot), NOW)
@@ -244,7 +244,7 @@ def test_watch_filters_and_ends_after_count(cars: Cars) -> None:
     assert "/state/mode  " in shown
 
 
-async def test_the_sdk_does_the_same_both_ways(cars: Cars) -> None:
+async def test_sdk_does_the_same_both_ways(cars: Cars) -> None:
     async with aio.Fleet(cars.endpoint) as fleet:
         assert len(await fleet.history("red/state/mode", last=5)) == 1
         found = await fleet.wait("*/state/health", "pid > 0", timeout_s=20)
@@ -309,7 +309,7 @@ async def test_watch_loses_no_reading_between_query_and_subscription(endpoint: s
 # ---------------------------------------------------------------------- pure
 
 
-def test_the_topics_that_a_key_expression_can_match() -> None:
+def test_topics_that_a_key_expression_can_match() -> None:
     assert [topic.name for topic in topics_under("fleet/red/sensor/range")] == ["sensor/range"]
     assert [topic.name for topic in topics_under("fleet/*/*/battery")] == ["sensor/battery"]
     assert [topic.name for topic in topics_under("fleet/@recorder/**")] == ["@recorder/status", "@recorder/mark"]

@@ -16,7 +16,7 @@ def clock_of(off_s: float, delays_s: list[float], boot_id: str = "a") -> Gateway
 
 
 @pytest.mark.parametrize("off_s", [-86_400.0, -240.0, 0.0, 7.0, 240.0])
-def test_the_message_with_the_shortest_way_tells(off_s: float) -> None:
+def test_message_with_the_shortest_way_tells(off_s: float) -> None:
     found = clock_of(off_s, [9.0, 8.0, 0.01, 20.0]).off_s
     assert found == pytest.approx(off_s, abs=0.02)
 
@@ -37,7 +37,7 @@ def test_clock_offset_starts_anew_with_new_gateway_process() -> None:
     assert clock.off_s == 0.0
 
 
-def test_the_words_name_how_far_and_which_side() -> None:
+def test_words_name_how_far_and_which_side() -> None:
     assert describe_clock("red", None) == describe_clock("red", 4.9) == describe_clock("red", -5.0) == ""
     assert "4 min 10 s behind" in describe_clock("red", -250.0)
     assert "2 h 6 s ahead" in describe_clock("red", 7206.2)

@@ -21,7 +21,7 @@ TWO = "--connect tcp/10.0.0.2:7447 --fleet two"
         ("fleet up --fleet three", "fleet up --fleet three"),
     ],
 )
-def test_a_command_that_reaches_a_fleet_gets_its_options(command: str, completed: str) -> None:
+def test_command_that_reaches_a_fleet_gets_its_options(command: str, completed: str) -> None:
     assert complete_command(command, "--fleet two") == completed
     assert complete_command(command, "") == command
     assert complete_hints(f"First `{command}`, then `fleet down`.", "--fleet two") == (

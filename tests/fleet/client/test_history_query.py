@@ -85,7 +85,7 @@ def newest(count: int) -> list[float]:
     return [round(centimetres(number) / 100, 4) for number in range(SENT - count, SENT)]
 
 
-def test_the_last_so_many_come_oldest_first(remembered: Remembered) -> None:
+def test_last_so_many_come_oldest_first(remembered: Remembered) -> None:
     done = get(remembered, "red/sensor/range", "--last", "100", "--json")
     assert done.returncode == 0
     rows = [json.loads(line) for line in done.stdout.splitlines()]
@@ -205,7 +205,7 @@ def test_how_a_history_is_asked_for(last: int | None, since_s: float | None, sel
 
 
 @pytest.mark.parametrize(("last", "since_s"), [(None, None), (0, None), (None, 0.0), (None, float("nan"))])
-def test_a_history_of_nothing_is_refused(last: int | None, since_s: float | None) -> None:
+def test_history_of_nothing_is_refused(last: int | None, since_s: float | None) -> None:
     with pytest.raises(ValueError, match=r"needs last|not allowed"):
         history_query.selector("fleet/red/sensor/range", last=last, since_s=since_s)
 

@@ -43,7 +43,7 @@ def told(until: Until, steps: Steps, lasts_s: float = 0.0) -> Progress:
         (Until.OVER, [("answer", "sent", 0.0), ("event", "superseded", 0.0)], "superseded", False),
     ],
 )
-def test_the_last_word(until: Until, steps: Steps, phase: str, ok: bool) -> None:
+def test_last_word(until: Until, steps: Steps, phase: str, ok: bool) -> None:
     outcome = told(until, steps, 2.0).outcome
     assert outcome is not None
     assert (outcome.phase, outcome.ok) == (phase, ok)
@@ -65,7 +65,7 @@ def test_not_known_yet(until: Until, steps: Steps) -> None:
 @pytest.mark.parametrize("verb", sorted({*COMMANDS, *EFFECTS} - {"*"}))
 @pytest.mark.parametrize("until", Until)
 @pytest.mark.parametrize("phase", ["sent", "complete", "superseded", "expired", "failed", "rejected"])
-def test_an_outcome_has_words_also_where_the_gateway_said_none(verb: str, until: Until, phase: str) -> None:
+def test_outcome_has_words_also_where_the_gateway_said_none(verb: str, until: Until, phase: str) -> None:
     progress = Progress("red", until, 100.0, verb=verb)
     progress.on_answer("sent", "", "", 0.0, 101.0)
     progress.on_event(phase, "", "", 0.0, 102.0)

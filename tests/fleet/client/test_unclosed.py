@@ -68,6 +68,6 @@ def test_script_with_unclosed_fleet_ends_with_resource_warning(
         wait_for(lambda: not bus.tokens("fleet/@operator/*"), "its token is gone")
 
 
-def test_a_closed_one_is_not_complained_about(endpoint: str) -> None:
+def test_closed_one_is_not_complained_about(endpoint: str) -> None:
     done = run(endpoint, "-W", "error::ResourceWarning", "-c", f"{OPEN}fleet.close()")
     assert (done.returncode, done.stderr) == (0, "")

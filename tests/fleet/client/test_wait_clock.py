@@ -58,7 +58,7 @@ def test_hold_duration_restarts_and_ignores_clock_steps(step_s: float, topic: st
 
 
 @given(st.lists(st.tuples(st.booleans(), st.sampled_from([0.0, 0.0, 0.0, HOUR_S, -HOUR_S, 0.4, -0.4])), max_size=60))
-def test_a_wait_ends_only_after_its_time_and_always_then(seen: list[tuple[bool, float]]) -> None:
+def test_wait_ends_only_after_its_time_and_always_then(seen: list[tuple[bool, float]]) -> None:
     wait, held_s = SteppedWait(for_s=FOR_S), float("-inf")
     for near, step_s in seen:
         ended = wait.hear(0.2 if near else 0.9, step_s=step_s)
@@ -91,13 +91,13 @@ def test_published_readings_count_after_stored_one_from_future() -> None:
     assert [wait.hear() for _ in range(3)] == [False, False, True]
 
 
-def test_a_sender_whose_clock_is_ahead_is_heard() -> None:
+def test_sender_whose_clock_is_ahead_is_heard() -> None:
     wait = SteppedWait()
     value = Reading("fleet/red/sensor/range", wait.clock + timedelta(seconds=HOUR_S), pb.Range(range_m=0.2))
     assert wait._wait.ends(value, wait.clock, wait.now_s)
 
 
-def test_a_replay_is_old_and_published_now() -> None:
+def test_replay_is_old_and_published_now() -> None:
     wait = SteppedWait(for_s=2.0)
     assert not any(wait.query(-HOUR_S + at) for at in range(4)), "an answer may have waited for an hour"
     wait.wall_s = -7 * HOUR_S

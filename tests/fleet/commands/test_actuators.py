@@ -16,7 +16,7 @@ HORN = COMMANDS["whistle"]._replace(min_duration_s=0.5, max_duration_s=10.0, sub
 
 
 @pytest.mark.parametrize("row", PLAIN, ids=lambda row: row.verb)
-def test_the_row_is_the_subcommand(row: Any) -> None:
+def test_row_is_the_subcommand(row: Any) -> None:
     listed = [names[row.subcommand] for names in cli.COMMANDS.values() if row.subcommand in names]
     assert listed == [(f"fleet.commands.actuators:{row.subcommand}", row.summary)]
     help_text = CliRunner().invoke(getattr(actuators, row.subcommand), ["--help"]).output
@@ -25,7 +25,7 @@ def test_the_row_is_the_subcommand(row: Any) -> None:
     assert "--for" not in help_text
 
 
-def test_a_row_with_a_maximum_duration_adds_an_option() -> None:
+def test_row_with_a_maximum_duration_adds_an_option() -> None:
     horn: click.Command = actuators._plain_command(HORN)
     assert "fleet horn red --for 2s\n" in CliRunner().invoke(horn, ["--help"]).output
     wrong = [(["red", "--for", "11s"], "10s"), (["red", "--for", "400ms"], "500ms")]

@@ -49,7 +49,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_a_file_is_recognized_by_its_content(text: str, kind: FileKind) -> None:
+def test_file_is_recognized_by_its_content(text: str, kind: FileKind) -> None:
     assert recognize(text) is kind
 
 

@@ -23,7 +23,7 @@ def doctor(cars: Cars, *arguments: str) -> CompletedProcess[str]:
     return in_process.fleet("doctor", *arguments, "--connect", cars.endpoint, cwd=cars.directory)
 
 
-def test_a_car_has_its_likely_cause_and_ten_lines(cars: Cars) -> None:
+def test_car_has_its_likely_cause_and_ten_lines(cars: Cars) -> None:
     well = doctor(cars, "green")
     assert well.returncode == 0, well.stdout
     assert well.stdout.splitlines()[0].startswith("green: ")
@@ -49,7 +49,7 @@ def test_a_car_has_its_likely_cause_and_ten_lines(cars: Cars) -> None:
     assert unknown.stderr.endswith(" mean red?\n")
 
 
-def test_a_damaged_session_has_its_findings(tmp_path: Path) -> None:
+def test_damaged_session_has_its_findings(tmp_path: Path) -> None:
     session = tmp_path / "sessions" / "20260921T141320Z-fleet"
     session.mkdir(parents=True)
     data = written(session / "0001.mcap").data

@@ -27,7 +27,7 @@ def test_one_is_shown_by_each_of_its_names(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in (EXAMPLES / "fleets").iterdir()))
-def test_a_copied_fleet_file_has_its_plan_beside_it(name: str, tmp_path: Path) -> None:
+def test_copied_fleet_file_has_its_plan_beside_it(name: str, tmp_path: Path) -> None:
     done = fleet("example", "copy", name, "lab", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     copied = read_fleet(tmp_path / "lab" / name)

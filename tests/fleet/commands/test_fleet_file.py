@@ -220,7 +220,7 @@ def test_check_leaves_car_with_gateway_alone(command: Command, endpoint: str, tm
 # ------------------------------------------------------------------ schema, init
 
 
-def test_the_schema_is_printed(command: Command) -> None:
+def test_schema_is_printed(command: Command) -> None:
     assert json.loads(command("schema").stdout)["title"] == "fleet file"
 
 
@@ -323,13 +323,13 @@ def test_nothing_found_says_what_to_do(command: Command, port: Port, tmp_path: P
     assert not (tmp_path / "fleet.yaml").exists()
 
 
-def test_a_link_that_is_none_is_wrong_use(command: Command) -> None:
+def test_link_that_is_none_is_wrong_use(command: Command) -> None:
     done = command("init", "--yes", "--link", "11:22:33:44:55:66")
     assert done.returncode == 2
     assert "not a link" in done.stderr
 
 
-def test_a_person_names_the_cars(terminal: Callable[..., Terminal], simulate: Any, port: Port, tmp_path: Path) -> None:
+def test_person_names_the_cars(terminal: Callable[..., Terminal], simulate: Any, port: Port, tmp_path: Path) -> None:
     simulate("a")
     (tmp_path / "fleet.yaml").write_text("mine\n")
     init = terminal("init", "--for", "5", "--link", f"{tmp_path}/a.tty", "--link", port.path)

@@ -41,7 +41,7 @@ def test_without_a_supervisor_the_fleet_file_here_has_the_groups(client: Fleet) 
         resolve_cars(client, ["@lap"])
 
 
-def test_the_running_fleet_has_the_groups(client: Fleet) -> None:
+def test_running_fleet_has_the_groups(client: Fleet) -> None:
     Path("fleet.yaml").write_text(FILE, encoding="utf-8")
     key = "fleet/@supervisor/status"
     groups = {"b": "green", "a": "red,blue"}
@@ -76,7 +76,7 @@ def test_lists_and_waits_take_groups(client: Fleet) -> None:
     assert len(tokens) == 3
 
 
-def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
+def test_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
     tokens = [client.bus.token(keys.car_token("fleet", car)) for car in ("red", "blue")]
 
     def error(*words: str) -> str:
@@ -99,7 +99,7 @@ def test_a_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
     assert len(tokens) == 2
 
 
-def test_the_shell_completes_groups_of_the_fleet_file(client: Fleet) -> None:
+def test_shell_completes_groups_of_the_fleet_file(client: Fleet) -> None:
     Path("fleet.yaml").write_text(FILE, encoding="utf-8")
     context = click.Context(cli, info_name="fleet")
     context.params["connect"] = client.bus.endpoint
@@ -119,7 +119,7 @@ def test_wrong_session_or_file_name_suggests_likely_one(tmp_path: Path, client: 
     assert done.output.endswith(" mean plan.yaml?\n")
 
 
-def test_the_prompt_of_a_name_proposes_a_valid_one() -> None:
+def test_prompt_of_a_name_proposes_a_valid_one() -> None:
     @click.command()
     def ask() -> None:
         prompt_name("name", None, set())
@@ -134,5 +134,5 @@ def test_the_prompt_of_a_name_proposes_a_valid_one() -> None:
 @pytest.mark.parametrize(
     ("wrong", "near"), [("avoid", "obstacle_avoidance"), ("trakcing", "tracking"), ("xy", None), ("LIGHT", "light")]
 )
-def test_the_nearest_name_is_alike_or_contains_the_word(wrong: str, near: str | None) -> None:
+def test_nearest_name_is_alike_or_contains_the_word(wrong: str, near: str | None) -> None:
     assert nearest(wrong, ["manual", "tracking", "obstacle_avoidance", "light"]) == near

@@ -46,7 +46,7 @@ def test_supervisor_with_token_gap_has_not_ended(monkeypatch: pytest.MonkeyPatch
         assert down.found == [(ended, False)]
 
 
-def test_a_supervisor_without_a_token_and_a_status_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_supervisor_without_a_token_and_a_status_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lifecycle, "SUPERVISOR_LOST_S", 1.0)
     with Bus.open(free_endpoint(), start_hub=True) as ours:
         down = Down(ours)

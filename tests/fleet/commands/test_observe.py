@@ -31,13 +31,13 @@ def row(**messages: Any) -> dict[str, Any]:
         (pb.Link(state="online", last_rx_s=1), "unknown", False, "online"),
     ],
 )
-def test_an_unheard_car_is_shown_as_one(link: pb.Link, motors: str, unheard: bool, cell: str) -> None:
+def test_unheard_car_is_shown_as_one(link: pb.Link, motors: str, unheard: bool, cell: str) -> None:
     told = row(link=link, safety=pb.Safety(motors=motors))
     assert (told["unheard"], cell_text("link", told)) == (unheard, cell)
     assert told["last_rx_s"] == (round(link.last_rx_s, 3) if link.HasField("last_rx_s") else None)
 
 
-def test_a_contradicted_platform_is_shown() -> None:
+def test_contradicted_platform_is_shown() -> None:
     words = "a voltage of 7.91 V, which no raspberry_pi car sends"
     told = row(health=pb.Health(platform="raspberry_pi", platform_contradictions=[words]))
     assert (told["platform"], told["platform_contradictions"]) == ("raspberry_pi", [words])
@@ -47,7 +47,7 @@ def test_a_contradicted_platform_is_shown() -> None:
 
 
 @pytest.mark.parametrize(("columns", "left_out"), [("80", {"PLATFORM", "VERDICT"}), ("200", set())])
-def test_the_table_of_cars_fits_a_terminal(
+def test_table_of_cars_fits_a_terminal(
     columns: str, left_out: set[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("COLUMNS", columns)

@@ -15,7 +15,7 @@ def test_columns_are_as_wide_as_their_widest_cell() -> None:
     assert list(aligned([])) == []
 
 
-def test_a_later_block_narrows_no_column() -> None:
+def test_later_block_narrows_no_column() -> None:
     lines = list(aligned(chain([("wide cell", "1")], repeat(("x", "2"), 3000), [("a wider cell", "3"), ("x", "4")])))
     assert {line.index("2") for line in lines if "2" in line} == {11, 14}
     assert lines[0].index("1") == 11

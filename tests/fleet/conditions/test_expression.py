@@ -140,7 +140,7 @@ def test_invalid_condition_error_has_column(text: str, column: int, words: str) 
         ("range_m < +1e-7", "range_m < 1e-07"),
     ],
 )
-def test_a_condition_has_one_way_to_be_written(text: str, normal: str) -> None:
+def test_condition_has_one_way_to_be_written(text: str, normal: str) -> None:
     assert str(parse(text, NAMES)) == normal
 
 

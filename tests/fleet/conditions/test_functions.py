@@ -43,7 +43,7 @@ def came(observer: FleetObserver, at: float, range_m: float | None) -> None:
     observer.on_sample(Sample("fleet/red/sensor/range", payload, encoding, 0, 1), at, None)
 
 
-def test_a_plan_reads_a_function_of_the_newest_readings() -> None:
+def test_plan_reads_a_function_of_the_newest_readings() -> None:
     expression = parse(needs("slope(range_m) < -0.5")).roles["scout"].needs
     assert expression is not None
     assert parse(needs(str(expression))).roles["scout"].needs == expression, "its text is a condition, too"
@@ -74,7 +74,7 @@ def test_a_plan_reads_a_function_of_the_newest_readings() -> None:
         ("rate(range_m)", "rate(range_m) … number, … condition"),
     ],
 )
-def test_a_wrong_call_is_an_error(condition: str, words: str) -> None:
+def test_wrong_call_is_an_error(condition: str, words: str) -> None:
     with pytest.raises(BadExpression) as found:
         parse_condition(condition, NAMES, ALIASES, FUNCTIONS)
     assert has_parts(found.value.words, words)

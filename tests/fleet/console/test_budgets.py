@@ -46,7 +46,7 @@ def test_flood_closes_own_page_only() -> None:
     assert budgets.may_send("bob", page_budget(), 1.0)
 
 
-def test_a_new_page_brings_its_device_no_new_budget() -> None:
+def test_new_page_brings_its_device_no_new_budget() -> None:
     budgets, taken = Budgets(), 0
     for _ in range(20):
         page = page_budget()
@@ -101,7 +101,7 @@ def test_stops_are_merged_and_after_each_one_is_sent(pauses: list[float]) -> Non
     assert all(later - before >= MERGE_S - 1e-9 for before, later in pairwise(sent))
 
 
-def test_a_flood_of_stops_is_ten_a_second() -> None:
+def test_flood_of_stops_is_ten_a_second() -> None:
     moments, merge = random.Random(1), StopMerge()
     times = sorted(moments.uniform(0.0, 10.0) for _ in range(50_000))
     assert sum(merge.delay_s(at) is not None for at in times) <= 10.0 / MERGE_S + 2

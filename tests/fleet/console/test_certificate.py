@@ -55,12 +55,12 @@ def test_many_addresses_need_no_new_certificate_each_time(tmp_path: Path) -> Non
     assert ensure_certificate(many, NOW, tmp_path) == ensure_certificate(many, NOW, tmp_path)
 
 
-def test_a_certificate_is_renewed_a_month_before_its_end() -> None:
+def test_certificate_is_renewed_a_month_before_its_end() -> None:
     for days, needed in ((31, False), (30, True), (-1, True)):
         assert needs_renewal(["a"], ["a"], NOW + timedelta(days=days), NOW) is needed
 
 
-def test_a_new_address_is_written_for_fleet_console_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_new_address_is_written_for_fleet_console_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
     addresses = ["192.168.1.5"]
     monkeypatch.setattr(network_console, "own_addresses", lambda: list(addresses))
@@ -76,7 +76,7 @@ def test_a_new_address_is_written_for_fleet_console_pair(tmp_path: Path, monkeyp
         listener.close()
 
 
-def test_the_people_file_is_private_shared_and_survives_damage(tmp_path: Path) -> None:
+def test_people_file_is_private_shared_and_survives_damage(tmp_path: Path) -> None:
     path = tmp_path / "state" / "fleet.@console.json"
     ours, theirs = PeopleFile(path), PeopleFile(path)
     assert ours.read() == PeopleBook()

@@ -9,7 +9,7 @@ def event(phase: str, command_id: str = "a", **fields: object) -> pb.CommandEven
     return pb.CommandEvent(id=command_id, verb="stop", sender="mia", kind="person", phase=phase, **fields)  # type: ignore[arg-type]  # in turn
 
 
-def test_a_command_has_its_course_its_frames_and_its_evidence() -> None:
+def test_command_has_its_course_its_frames_and_its_evidence() -> None:
     ledger = CommandLedger()
     ledger.on_event(event("asked"))
     ledger.on_event(event("sent", took_s=0.05))
@@ -29,7 +29,7 @@ def test_a_command_has_its_course_its_frames_and_its_evidence() -> None:
     }
 
 
-def test_a_refusal_is_marked_and_old_commands_are_forgotten() -> None:
+def test_refusal_is_marked_and_old_commands_are_forgotten() -> None:
     ledger = CommandLedger()
     for number in range(MAX_COMMANDS + 5):
         ledger.on_event(event("rejected", str(number), reason="held", words="red is on hold"))
@@ -39,7 +39,7 @@ def test_a_refusal_is_marked_and_old_commands_are_forgotten() -> None:
     assert all(row["bad"] for row in rows)
 
 
-def test_the_panel_has_the_doctors_lines() -> None:
+def test_panel_has_the_doctors_lines() -> None:
     view = CarView("red", "#ff0000")
     view.on_presence(0.0, present=True)
     view.on_message("state/link", pb.Link(state="lost", reason="unplugged", since_s=4), 1.0)

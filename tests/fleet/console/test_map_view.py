@@ -80,7 +80,7 @@ def test_map_shows_measured_pose_with_error_and_prefers_truth() -> None:
     assert view.places(14.0)["red"][0] == 1.0
 
 
-def test_an_old_place_has_its_age_and_is_forgotten() -> None:
+def test_old_place_has_its_age_and_is_forgotten() -> None:
     view = MapView()
     view.on_message("red", TRUTH, truth(5.0), 0.0)
     assert {at: [place[5] for place in view.places(at).values()] for at in (0.9, 1.5, 29.9, 30.1)} == {
@@ -104,7 +104,7 @@ def test_map_trail_is_bounded_and_standing_car_adds_nothing() -> None:
     assert view.trails(300.0) == {"red": [(300_000, 1.0, 0.0)]}, "it counts from another origin"
 
 
-def test_a_floor_is_told_while_its_simulation_runs() -> None:
+def test_floor_is_told_while_its_simulation_runs() -> None:
     view = MapView()
     assert view.world(0.0) is None
     point = pb.SimPoint(x_m=1, y_m=2)

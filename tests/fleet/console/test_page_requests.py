@@ -45,7 +45,7 @@ def test_malformed_page_message_is_refused(text: str) -> None:
         {"verb": "estop", "why": "x" * 201},
     ],
 )
-def test_a_bad_command_is_refused(fields: dict[str, Any]) -> None:
+def test_bad_command_is_refused(fields: dict[str, Any]) -> None:
     with pytest.raises(BadPageMessage):
         message(**fields).request()
 
@@ -56,7 +56,7 @@ def test_bad_cars_are_refused(names: Any) -> None:
         message(cars=names).cars()
 
 
-def test_a_good_command_becomes_its_request() -> None:
+def test_good_command_becomes_its_request() -> None:
     assert message(verb="led", rgb=[1, 2, 3]).request().message.g == 2
     assert message(verb="servo", deg=30).request().message.deg == 30
     assert message(verb="mode", mode="tracking", take=True).request().take

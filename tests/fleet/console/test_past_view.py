@@ -56,7 +56,7 @@ def question(path: Path, at_s: float, **more: Any) -> dict[str, Any]:
         (15.5, "blue", "stop", "obstacle_avoidance", None, "quiet"),
     ],
 )
-def test_a_moment_is_shown_as_the_live_page_would(
+def test_moment_is_shown_as_the_live_page_would(
     session: Path, at_s: float, car: str, motion: str, mode: str, hold: str | None, link: str
 ) -> None:
     found = answer(question(session, at_s))
@@ -150,7 +150,7 @@ def test_past_lanes_have_times_and_marks(session: Path) -> None:
     assert answer({"path": str(session.parent / "none.mcap")})["ok"] is False
 
 
-def test_a_damaged_session_says_what_is_lost(session: Path, tmp_path: Path) -> None:
+def test_damaged_session_says_what_is_lost(session: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(session.read_bytes()[:-2000])
     found = answer(question(cut, 2.5))
@@ -161,7 +161,7 @@ def test_a_damaged_session_says_what_is_lost(session: Path, tmp_path: Path) -> N
     assert "damaged" in answer(question(tmp_path / "bad.mcap", 2.5))["words"]
 
 
-def test_the_questions_of_a_page() -> None:
+def test_questions_of_a_page() -> None:
     asked = {"at_ms": 1000.7, "car": "red", "span_s": 60, "series": [list(RANGE)], "more": 1}
     plain = {"at_ms": 5, "car": "", "span_s": 0.0, "map": False, "plan": False, "series": []}
     assert moment_question(json.dumps(asked)) == plain | {

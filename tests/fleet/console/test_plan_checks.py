@@ -62,7 +62,7 @@ def here(*cars: str) -> tuple[tuple[float, Sample], ...]:
     return tuple(found)
 
 
-async def test_a_plan_is_checked_as_the_parser_does(checks: PlanChecks) -> None:
+async def test_plan_is_checked_as_the_parser_does(checks: PlanChecks) -> None:
     with pytest.raises(BadPlan) as found:
         parse(BAD)
     assert await is_good(checks, GOOD)
@@ -102,7 +102,7 @@ async def test_plan_check_finds_fleet_file_faults_and_cuts_long_texts(checks: Pl
     assert len(told["why"]) <= MAX_TOLD_CHARACTERS
 
 
-async def test_a_person_has_few_open_checks_and_others_have_theirs(checks: PlanChecks) -> None:
+async def test_person_has_few_open_checks_and_others_have_theirs(checks: PlanChecks) -> None:
     mine = [asyncio.ensure_future(checks.check(PlanQuestion(PLAN), "mia")) for _ in range(MAX_OPEN_CHECKS)]
     await asyncio.sleep(0)
     assert checks.is_busy("mia")
@@ -125,7 +125,7 @@ async def test_abandoned_or_dead_plan_check_spoils_no_other(checks: PlanChecks) 
     assert await is_good(checks, GOOD)
 
 
-async def test_the_process_ends_when_nothing_was_checked_for_a_while(tmp_path: Path) -> None:
+async def test_process_ends_when_nothing_was_checked_for_a_while(tmp_path: Path) -> None:
     checks = PlanChecks(tmp_path / "fleet.yaml", idle_s=0.0)
     assert await is_good(checks, GOOD)
     await asyncio.to_thread(wait_for, lambda: not workers(), "it has ended")

@@ -17,7 +17,7 @@ from fleet.policy.plan.plan_parser import parse
         (f"# {'x' * 200}", [], "x" * MAX_PLAN_NAME_LENGTH),
     ],
 )
-def test_the_name_is_the_first_comment_or_the_roles(text: str, roles: list[str], name: str) -> None:
+def test_name_is_the_first_comment_or_the_roles(text: str, roles: list[str], name: str) -> None:
     assert plan_name(text, roles) == name
 
 

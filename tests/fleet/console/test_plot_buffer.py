@@ -21,7 +21,7 @@ def test_values_come_once_by_the_number_of_their_series() -> None:
     assert buffer.take() == {}
 
 
-def test_a_page_that_reads_nothing_costs_no_more_memory() -> None:
+def test_page_that_reads_nothing_costs_no_more_memory() -> None:
     buffer = PlotBuffer([Series("red", "sensor/line", "left_inner")])
     for _ in range(MAX_BUFFERED_VALUES + 10):
         buffer.add("red", "sensor/line", pb.Line())

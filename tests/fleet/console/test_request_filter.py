@@ -64,22 +64,22 @@ FOREIGN = [
 
 
 @pytest.mark.parametrize("headers", FOREIGN)
-def test_a_foreign_socket_is_refused(headers: dict[str, str]) -> None:
+def test_foreign_socket_is_refused(headers: dict[str, str]) -> None:
     (first,) = call("websocket", "/ws", headers)
     assert (first["type"], first["code"]) == ("websocket.close", 1008)
 
 
 @pytest.mark.parametrize("headers", FOREIGN)
-def test_a_foreign_post_is_refused(headers: dict[str, str]) -> None:
+def test_foreign_post_is_refused(headers: dict[str, str]) -> None:
     assert call("http", "/anything", headers, "POST")[0]["status"] == 403
 
 
 @pytest.mark.parametrize("headers", [each for each in FOREIGN if each.get("cookie") == OURS["cookie"]])
-def test_a_foreign_stop_is_refused(headers: dict[str, str]) -> None:
+def test_foreign_stop_is_refused(headers: dict[str, str]) -> None:
     assert call("http", "/stop", headers, "POST")[0]["status"] == 403
 
 
-def test_a_stop_of_our_page_needs_no_cookie() -> None:
+def test_stop_of_our_page_needs_no_cookie() -> None:
     assert call("http", "/stop", but(cookie=None), "POST")[0]["status"] == 200
 
 

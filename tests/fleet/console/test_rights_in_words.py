@@ -97,7 +97,7 @@ def decided(context: refusals.CommandContext, sender: Sender, action: Action) ->
     return str(refusal[0]) if refusal is not None and str(refusal[0]) in RULES else None
 
 
-def test_the_page_shows_what_the_gateway_decides() -> None:
+def test_page_shows_what_the_gateway_decides() -> None:
     seen = set()
     for context, authority in cars():
         estops = context.authority.estops
@@ -116,7 +116,7 @@ def test_the_page_shows_what_the_gateway_decides() -> None:
     assert {code for _, code in seen} == {None, *RULES}
 
 
-def test_the_words_name_the_person_the_car_and_the_rule() -> None:
+def test_words_name_the_person_the_car_and_the_rule() -> None:
     red = Authority(People.parse(["teacher:lead", "ann", "eve:other"]))
     assert refusals_shown("red", red, EVE)[Right.MOVE] == "eve drives other cars, not red."
     assert refusals_shown("red", red, ZED)[Right.ACT] == "zed watches and stops: the fleet file does not list zed."
@@ -140,7 +140,7 @@ def test_recorder_and_plan_are_for_leads_if_there_are_any() -> None:
     assert rights_of(ANN, {})["manage"] == ""
 
 
-def test_a_fleet_can_be_paused_if_one_car_lets_it() -> None:
+def test_fleet_can_be_paused_if_one_car_lets_it() -> None:
     strict = Authority(People.parse(["teacher:lead", "ann"]))
     assert rights_of(ANN, {"red": strict})["pause"] == LEADS_ONLY
     assert rights_of(ANN, {"red": strict, "blue": Authority()})["pause"] == ""

@@ -62,7 +62,7 @@ def test_download_has_files_as_they_are_and_no_links(place: Path) -> None:
     assert [each.name for each in files_of(place / "one" / "0001.mcap")] == ["0001.mcap"]
 
 
-def test_a_growing_file_is_read_as_far_as_it_reached(place: Path) -> None:
+def test_growing_file_is_read_as_far_as_it_reached(place: Path) -> None:
     path = place / "one" / "0001.mcap"
     size = path.stat().st_size
     parts = read_file(path)

@@ -16,7 +16,7 @@ def keys_of(name: str) -> set[str]:
     return set(re.findall(r"^  (\w+):", body[1], re.MULTILINE))
 
 
-def test_the_texts_name_every_motion_and_unknown() -> None:
+def test_texts_name_every_motion_and_unknown() -> None:
     assert keys_of("motions") == {*Motion, "unknown"}
 
 

@@ -69,7 +69,7 @@ def test_clients_that_connect_again_and_again_wait_behind_everybody_else() -> No
     assert order == ["a", "b", "lead", "a"]
 
 
-def test_a_flood_costs_no_other_address_its_turn() -> None:
+def test_flood_costs_no_other_address_its_turn() -> None:
     waiting = used_up(room())
     for number in range(1000):
         waiting.add(number, CLASS, 0.0)

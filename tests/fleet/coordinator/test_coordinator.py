@@ -70,7 +70,7 @@ def truth(cars: Cars, car: str) -> str:
     return str(cars.sim.say({"car": car, "ask": "truth"})["mode"])
 
 
-def test_a_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> None:
+def test_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> None:
     seen: list[bus.Sample] = []
     cars.bus.subscribe("fleet/@coordinator/**", seen.append)
     process = coordinator(cars, tmp_path / "plan.yaml")
@@ -153,7 +153,7 @@ def test_unsupported_role_is_explained_and_not_asked_for(cars: Cars, tmp_path: P
     assert process.stderr == ""
 
 
-def test_a_plan_with_a_mistake_is_wrong_use(cars: Cars, tmp_path: Path) -> None:
+def test_plan_with_a_mistake_is_wrong_use(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {role: fast}}")
     assert process.wait() == 2
     assert "plan.yaml:1:21: error: fixed.red.role: " in process.stderr
@@ -360,7 +360,7 @@ def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: 
     assert following.end(signal.SIGTERM) == 0
 
 
-def test_a_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path) -> None:
+def test_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path) -> None:
     process = coordinator(cars, tmp_path / "plan.yaml", "roles: {watch: {mode: manual, cars: [green, blue]}}")
     lines = Lines(process)
     lines.until("green", "manual", "role watch")

@@ -116,7 +116,7 @@ def test_coordinator_survives_foreign_payloads(started: Started) -> None:
     assert not [words for words in started.said if INTERNAL_ERROR in words]
 
 
-def test_a_finished_plan_begins_anew_when_it_is_restarted(started: Started) -> None:
+def test_finished_plan_begins_anew_when_it_is_restarted(started: Started) -> None:
     def until(phase: str) -> None:
         while (decision := started.decided.get(timeout=PATIENCE_S)).subject != "phase" or decision.decided != phase:
             pass
@@ -141,7 +141,7 @@ def test_a_finished_plan_begins_anew_when_it_is_restarted(started: Started) -> N
     until("done")
 
 
-def test_a_decision_is_persisted_before_it_is_published(started: Started) -> None:
+def test_decision_is_persisted_before_it_is_published(started: Started) -> None:
     """Otherwise a coordinator that is killed at that moment leaves commands that the next one does not know."""
     assert started.ask(PHASES.encode()).status == "sent"
     wait_for(lambda: len(started.persisted) == 2, "both phases are decided")

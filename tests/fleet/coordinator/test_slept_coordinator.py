@@ -12,7 +12,7 @@ from schemas.process.suspend import SleepWatch
 from tests.fleet.coordinator.test_observer import come, said
 
 
-def test_the_coordinator_lets_its_readings_age_by_a_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_coordinator_lets_its_readings_age_by_a_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
     for counted, aged_s in ((False, 3600.0), (True, 0.0)):
         monkeypatch.setattr(coordinator, "MONOTONIC_COUNTS_SLEEP", counted)
         slept_s = [0.0]

@@ -10,7 +10,7 @@ from fleet.exporter.metrics import METRICS
 FILE = Path(__file__).parents[3] / "deploy" / "grafana.json"
 
 
-def test_the_file_is_what_the_table_makes() -> None:
+def test_file_is_what_the_table_makes() -> None:
     assert json.loads(FILE.read_text()) == dashboard(), "fleet exporter --dashboard > deploy/grafana.json"
 
 

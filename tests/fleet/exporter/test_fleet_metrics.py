@@ -36,7 +36,7 @@ def found(metrics: FleetMetrics, now: float = NOW) -> dict[tuple[str, ...], floa
     return {(metric.name, *labels): value for metric, labels, value in metrics.values(now)}
 
 
-def test_a_car_has_the_values_of_its_messages() -> None:
+def test_car_has_the_values_of_its_messages() -> None:
     metrics = FleetMetrics()
     car(metrics, "red")
     values = found(metrics, NOW + 1)
@@ -91,7 +91,7 @@ def test_each_command_phase_counts_once_with_closed_labels() -> None:
     }
 
 
-def test_a_word_that_is_none_counts_as_unknown() -> None:
+def test_word_that_is_none_counts_as_unknown() -> None:
     metrics = FleetMetrics()
     car(metrics, "red")
     metrics.on_sample(sample("fleet/red/state/mode", pb.Mode(asked="made_up", boot_id="1")), NOW)
@@ -112,7 +112,7 @@ def test_invented_cars_are_bounded() -> None:
 
 
 @pytest.mark.parametrize(("after_s", "there"), [(1.0, True), (10.0, False)])
-def test_a_recorder_that_has_ended_has_no_state(after_s: float, there: bool) -> None:
+def test_recorder_that_has_ended_has_no_state(after_s: float, there: bool) -> None:
     metrics = FleetMetrics()
     status = pb.Recording(state="recording", bytes=5, drops={"a": 1, "b": 2})
     metrics.on_sample(sample("fleet/@recorder/status", status), NOW)
@@ -121,7 +121,7 @@ def test_a_recorder_that_has_ended_has_no_state(after_s: float, there: bool) -> 
     assert (values.get(("fleet_recorder_dropped_messages",)) == 3) is there
 
 
-def test_a_payload_that_is_none_changes_nothing() -> None:
+def test_payload_that_is_none_changes_nothing() -> None:
     metrics = FleetMetrics()
     car(metrics, "red")
     before = found(metrics)

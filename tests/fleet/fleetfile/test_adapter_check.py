@@ -65,14 +65,14 @@ def test_auto_shares_adapters_with_cars_that_name_one() -> None:
     assert found["hci1"].connections == 1
 
 
-def test_the_adapters_of_the_computer(tmp_path: Path) -> None:
+def test_adapters_of_the_computer(tmp_path: Path) -> None:
     for name in ("hci10", "hci1", "hci0", "hci0:71"):
         (tmp_path / name).mkdir()
     assert list_adapters(tmp_path) == ["hci0", "hci1", "hci10"]
     assert list_adapters(tmp_path / "none") == []
 
 
-def test_the_command_warns_and_finds_no_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_command_warns_and_finds_no_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "adapters" / "hci0").mkdir(parents=True)
     monkeypatch.setattr(adapter_check, "ADAPTERS", tmp_path / "adapters")
     monkeypatch.setenv("FLEET_ENDPOINT", free_endpoint())

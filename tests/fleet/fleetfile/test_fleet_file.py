@@ -48,7 +48,7 @@ def _faults(text: str) -> list[str]:
     return str(caught.value).splitlines()
 
 
-def test_a_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> None:
+def test_car_overrides_its_type_and_a_type_the_defaults(tmp_path: Path) -> None:
     (tmp_path / "plan.yaml").touch()
     path = tmp_path / "fleet.yaml"
     path.write_text(LAYERS)
@@ -193,7 +193,7 @@ def test_car_without_fields_shows_how_to_write_link(value: str, example: str) ->
     assert f"`red: {example}`" in fault
 
 
-def test_a_wrong_endpoint_is_a_fault_of_the_file() -> None:
+def test_wrong_endpoint_is_a_fault_of_the_file() -> None:
     (line,) = _faults("endpoint: localhost:7447\ncars: {red: {link: tcp://h:9}}\n")
     assert ":1:11: error: endpoint: 'localhost:7447' " in line
     assert "tcp/HOST:PORT" in line
@@ -232,7 +232,7 @@ def test_two_cars_on_one_port(one: str, other: str, same: bool) -> None:
         assert len(_fleet(text).cars) == 2
 
 
-def test_a_port_behind_two_names(tmp_path: Path) -> None:
+def test_port_behind_two_names(tmp_path: Path) -> None:
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
     (line,) = _faults(f"cars: {{a: {{link: {tmp_path}/tty}}, b: {{link: {tmp_path}/by-id}}}}")
@@ -352,7 +352,7 @@ def test_any_pieces_are_a_link_or_a_bad_link(text: str) -> None:
         parse_link(text)
 
 
-def test_the_head_of_a_platform_keeps_its_case() -> None:
+def test_head_of_a_platform_keeps_its_case() -> None:
     fleet = _fleet("cars: {red: {link: COM3, platform: STM32+Fan_Level+HEAD=BaLa}}")
     assert fleet.cars["red"].platform == "stm32+fan_level+head=BaLa"
 
@@ -363,7 +363,7 @@ def test_only_fleet_files_know_simulated_links() -> None:
         parse_url("sim")
 
 
-def test_the_schema_is_one_for_editors() -> None:
+def test_schema_is_one_for_editors() -> None:
     made = schema_of(FileEntry, "fleet file")
     assert made["required"] == ["cars"]
     car = made["$defs"]["CarEntry"]["properties"]

@@ -38,7 +38,7 @@ def test_zenoh_takes_them_and_everything_else_is_denied() -> None:
 
 
 @pytest.mark.parametrize(("identity", "verb", "target"), list(product(EVERYONE, COMMANDS, ("red", "*"))))
-def test_a_command_is_sent_under_ones_own_identity_only(identity: str, verb: str, target: str) -> None:
+def test_command_is_sent_under_ones_own_identity_only(identity: str, verb: str, target: str) -> None:
     for message in ("query", "put"):
         assert allows(identity, "ingress", message, keys.command_key("fleet", target, verb, identity))
         assert not allows(identity, "ingress", message, keys.command_key("fleet", target, verb))
@@ -125,7 +125,7 @@ def test_whose_token(identity: str, token: str, allowed: bool) -> None:
     assert allows(identity, "ingress", "liveliness_token", token) == allowed
 
 
-def test_a_gateway_gets_the_wildcards_of_others() -> None:
+def test_gateway_gets_the_wildcards_of_others() -> None:
     for expression in ("fleet/**", "fleet/*/state/*", "*/*/state/mode"):
         for message in ("query", "declare_subscriber"):
             assert allows(car("red"), "egress", message, expression)

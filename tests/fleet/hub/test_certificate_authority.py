@@ -64,7 +64,7 @@ def test_malformed_certificate_request_is_refused(ca: certificate_authority.KeyP
         certificate_authority.sign_request(ca, request_bytes, "person.mia", NOW)
 
 
-def test_a_request_with_another_ones_signature_is_refused(ca: certificate_authority.KeyPair) -> None:
+def test_request_with_another_ones_signature_is_refused(ca: certificate_authority.KeyPair) -> None:
     _, request = certificate_authority.new_request("a")
     lines = request.splitlines()
     damaged = b"\n".join([*lines[:-2], lines[-2][::-1], lines[-1]])
@@ -105,7 +105,7 @@ DUE = LIFETIME * 0.9
 
 
 @pytest.mark.parametrize("names", [[], ["127.0.0.1", "north.local"]])
-def test_the_next_certificate_has_the_same_key_and_names(ca: certificate_authority.KeyPair, names: list[str]) -> None:
+def test_next_certificate_has_the_same_key_and_names(ca: certificate_authority.KeyPair, names: list[str]) -> None:
     key, request = certificate_authority.new_request("x")
     old = certificate_authority.KeyPair(certificate_authority.sign_request(ca, request, "person.mia", NOW, names), key)
     made = certificate_authority.renew(ca, old.certificate, request_for(old.key), "person.mia", NOW + DUE)
@@ -131,7 +131,7 @@ def test_no_next_certificate_for(ca: certificate_authority.KeyPair, wrong: str) 
         )
 
 
-def test_the_dates_are_read_as_the_library_reads_them(ca: certificate_authority.KeyPair) -> None:
+def test_dates_are_read_as_the_library_reads_them(ca: certificate_authority.KeyPair) -> None:
     for made in (ca.certificate, certificate_authority.issue(ca, "hub", NOW, ["127.0.0.1"]).certificate):
         read = x509.load_pem_x509_certificate(made)
         assert CertificateDates.of(made) == CertificateDates(read.not_valid_before_utc, read.not_valid_after_utc)

@@ -41,7 +41,7 @@ def test_nobody_else_can_read_its_files(tmp_path: Path) -> None:
     assert stat.S_IMODE(store.directory.stat().st_mode) == 0o700
 
 
-def test_a_second_time_changes_nothing(tmp_path: Path) -> None:
+def test_second_time_changes_nothing(tmp_path: Path) -> None:
     before = files(store_in(tmp_path).directory)
     assert files(store_in(tmp_path).directory) == before
 
@@ -78,14 +78,14 @@ def test_damaged_identities_are_named(entry: object, tmp_path: Path) -> None:
         store_in(tmp_path)
 
 
-def test_a_second_invitation_makes_the_first_certificate_worthless(tmp_path: Path) -> None:
+def test_second_invitation_makes_the_first_certificate_worthless(tmp_path: Path) -> None:
     store = store_in(tmp_path)
     for _ in range(2):
         store.reserve(person("mia"), NOW)
     assert common_names(store) == {"car.red", ME, "person.mia.2"}
 
 
-def test_a_lost_authority_is_said_and_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_lost_authority_is_said_and_nothing_is_overwritten(tmp_path: Path) -> None:
     store_in(tmp_path).directory.joinpath("ca.key").unlink()
     before = files(tmp_path)
     with pytest.raises(BrokenHub, match="join again"):

@@ -10,7 +10,7 @@ SHA256 = st.binary(min_size=32, max_size=32)
 
 
 @given(SHA256, st.sampled_from(["{}", " {} ", "{}\n"]), st.booleans())
-def test_a_code_is_read_as_a_person_types_it(fingerprint: bytes, around: str, lower: bool) -> None:
+def test_code_is_read_as_a_person_types_it(fingerprint: bytes, around: str, lower: bool) -> None:
     code = JoinCode.new(fingerprint)
     typed = around.format(str(code).replace("-", " "))
     assert JoinCode.parse(typed.lower() if lower else typed) == code
@@ -35,6 +35,6 @@ def test_two_codes_have_two_secrets() -> None:
     assert JoinCode.new(bytes(32)).secret != JoinCode.new(bytes(32)).secret
 
 
-def test_a_guess_of_another_length_or_alphabet_is_wrong() -> None:
+def test_guess_of_another_length_or_alphabet_is_wrong() -> None:
     code = JoinCode.new(bytes(32))
     assert not any(map(code.is_secret, ("", code.secret[:-1], f"{code.secret}2", "ä" * 12, code.pin)))

@@ -23,7 +23,7 @@ from tests.support import in_process
         (["car.red", "car.blue"], "car.blue"),
     ],
 )
-def test_a_computers_user_is_the_person_who_joined_last(
+def test_computers_user_is_the_person_who_joined_last(
     joins: list[str], user: str, monkeypatch: pytest.MonkeyPatch, tmp_path: object
 ) -> None:
     monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))

@@ -171,11 +171,11 @@ def test_hub_show_tells_who_is_connected_at_another_site(sites: Sites, monkeypat
         assert "(" not in found[ANN]
 
 
-def test_a_site_invites_nobody(sites: Sites) -> None:
+def test_site_invites_nobody(sites: Sites) -> None:
     assert not HubStore.of(sites.second).is_hub
 
 
-def test_the_hub_and_the_people_of_the_other_site_are_renewed_by_the_first_one(
+def test_hub_and_the_people_of_the_other_site_are_renewed_by_the_first_one(
     sites: Sites, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hub_renewals, "OWN_CHECK_INTERVAL_S", 0.2)

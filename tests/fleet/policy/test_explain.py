@@ -212,7 +212,7 @@ TABLE = rows("decisions")
 
 
 @pytest.mark.parametrize("row", TABLE, ids=lambda row: f"{row['case']}, {row['subject']}")
-def test_a_decision_is_explained(row: dict[str, str]) -> None:
+def test_decision_is_explained(row: dict[str, str]) -> None:
     case, subject = row["case"], row["subject"]
     if case in OF_ALL:
         run = _of_all(case)
@@ -237,5 +237,5 @@ def test_a_decision_is_explained(row: dict[str, str]) -> None:
     assert found in (*run.last.changed, *run.last.reworded)
 
 
-def test_the_table_has_every_kind() -> None:
+def test_table_has_every_kind() -> None:
     assert {row["kind"] for row in TABLE} == set(DecisionKind)

@@ -37,10 +37,10 @@ def test_no_assignment_costs_less(problem: tuple[dict[str, dict[str, int]], dict
     assert found == assign(costs, places)
 
 
-def test_a_car_makes_room_by_moving_others() -> None:
+def test_car_makes_room_by_moving_others() -> None:
     costs = {"x": {"a": -10, "b": -9}, "y": {"a": -10}, "z": {"b": -9, "c": -8}}
     assert assign(costs, {"a": 1, "b": 1, "c": 1}) == {"y": "a", "x": "b", "z": "c"}
 
 
-def test_a_role_that_is_worth_nothing_stays_empty() -> None:
+def test_role_that_is_worth_nothing_stays_empty() -> None:
     assert assign({"x": {"a": 3}}, {"a": 1}) == {}

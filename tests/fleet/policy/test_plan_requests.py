@@ -134,7 +134,7 @@ def test_lost_car_is_brought_to_rest_on_return_and_refusal_is_no_rest() -> None:
 
 
 @pytest.mark.parametrize("plan", [FLAT, PHASES])
-def test_a_coordinator_that_is_started_again_stays_stopped(plan: Any) -> None:
+def test_coordinator_that_is_started_again_stays_stopped(plan: Any) -> None:
     run = started(FLAT)
     ask(run, "stop")
     kept = to_persisted(FLAT, run.memory, run.now, 1000.0)

@@ -57,7 +57,7 @@ def test_each_part_that_differs_is_told_with_its_fields(
     assert [(each.part, list(each.fields)) for each in found] == changes
 
 
-def test_a_dry_run_is_the_first_decision_of_a_coordinator() -> None:
+def test_dry_run_is_the_first_decision_of_a_coordinator() -> None:
     run = PolicyRun(parse(TWO), "red", "blue")
     real = run.at(0.0)
     tried = try_plan(parse(TWO), FleetSnapshot(dict.fromkeys(("red", "blue"), HERE)), None, 0.0)
@@ -77,7 +77,7 @@ def test_dry_run_keeps_roles_in_force_and_tells_lacking_cars() -> None:
     assert [(each.role, each.decided) for each in tried.places] == [("guide", "2 of 3")]
 
 
-def test_a_car_that_is_left_alone_changes_nothing() -> None:
+def test_car_that_is_left_alone_changes_nothing() -> None:
     held = FleetSnapshot({"red": replace(HERE, held_by="mia")})
     (found,) = try_plan(parse(TWO), held, PlanInForce(parse(TWO), {"red": "left alone"}), 0.0).cars
     assert (found.role_before, found.role, found.is_changed) == ("", "", False)

@@ -35,7 +35,7 @@ def ready(process: "subprocess.Popen[str]") -> Path:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_closes_the_session_whole(number: signal.Signals, endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_signal_closes_the_session_whole(number: signal.Signals, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     process = start(RECORD, "--sessions", str(tmp_path), "--connect", endpoint, "--json")
     session = ready(process)
     out = publisher(bus, "red", "sensor/range")
@@ -88,7 +88,7 @@ def test_killed_it_loses_at_most_the_last_second(endpoint: str, bus: Bus, tmp_pa
     assert not opened.description.closed
 
 
-def test_a_full_disk_is_said_and_what_was_written_stays(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_full_disk_is_said_and_what_was_written_stays(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     states: list[str] = []
     bus.subscribe("fleet/@recorder/status", lambda sample: states.append(sample.message().state))  # type: ignore[attr-defined]
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000)); " + RECORD

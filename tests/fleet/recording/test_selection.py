@@ -59,7 +59,7 @@ def session(request: pytest.FixtureRequest, tmp_path: Path) -> Session:
         ([], None, None),
     ],
 )
-def test_a_part_is_what_a_filter_of_the_whole_gives(
+def test_part_is_what_a_filter_of_the_whole_gives(
     session: Session, keys: list[str] | None, start_ns: int | None, end_ns: int | None
 ) -> None:
     expressions = [keys] if isinstance(keys, str) else keys
@@ -111,5 +111,5 @@ def test_selection_reads_only_needed_chunks(tmp_path: Path) -> None:
         ("fleet/a.c/*", "fleet/abc/x", False),
     ],
 )
-def test_a_key_expression_matches_as_on_the_bus(expression: str, key: str, does: bool) -> None:
+def test_key_expression_matches_as_on_the_bus(expression: str, key: str, does: bool) -> None:
     assert matches(expression, key) is does

@@ -60,13 +60,13 @@ def test_message_behind_recalled_ones_starts_no_stream() -> None:
     assert numbers.missing == 0
 
 
-def test_a_number_that_goes_back_is_a_new_stream() -> None:
+def test_number_that_goes_back_is_a_new_stream() -> None:
     numbers = SequenceTracker()
     assert live(numbers, 7, 8, 1, 2, 4) == [True] * 5
     assert numbers.missing == 1
 
 
-def test_the_wrap_is_no_gap() -> None:
+def test_wrap_is_no_gap() -> None:
     numbers = SequenceTracker()
     top = (1 << 32) - 1
     live(numbers, top - 1)

@@ -45,7 +45,7 @@ def test_without_an_id_each_asked_one_counts() -> None:
     assert found.count == 2
 
 
-def test_a_flood_takes_no_memory() -> None:
+def test_flood_takes_no_memory() -> None:
     found = StopCount()
     for number in range(3 * MAX_RECENT_IDS):
         found.add(event("stop", str(number)))
@@ -76,7 +76,7 @@ def listed(path: Path) -> dict[str, object]:
     return found
 
 
-def test_the_recorder_notes_the_number_of_stops(recorded: Path) -> None:
+def test_recorder_notes_the_number_of_stops(recorded: Path) -> None:
     description = session_dir.SessionInfo.read(recorded)
     assert description is not None
     assert description.stops == 3
@@ -94,7 +94,7 @@ def test_where_the_number_is_not_known_the_events_are_counted(recorded: Path, de
     assert listed(recorded)["stops"] == 3
 
 
-def test_a_file_without_an_end_has_its_stops(recorded: Path) -> None:
+def test_file_without_an_end_has_its_stops(recorded: Path) -> None:
     (recorded / session_dir.SESSION_FILE).unlink()
     segment = recorded / "0001.mcap"
     segment.write_bytes(segment.read_bytes()[:-100])
@@ -102,7 +102,7 @@ def test_a_file_without_an_end_has_its_stops(recorded: Path) -> None:
     assert (about["state"], about["stops"]) == (SessionState.CUT, 3)
 
 
-def test_an_unreadable_session_has_no_number(recorded: Path) -> None:
+def test_unreadable_session_has_no_number(recorded: Path) -> None:
     (recorded / "0001.mcap").write_bytes(b"no MCAP")
     assert listed(recorded)["stops"] is None
     assert " -  " in in_process.fleet("sessions", recorded.parent).stdout

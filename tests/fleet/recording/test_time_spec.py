@@ -33,7 +33,7 @@ def in_cet() -> Iterator[None]:
         ("yesterday 12:00", NOON - DAY_S, 60),
     ],
 )
-def test_a_time_is_local_and_within_the_session(text: str, begins: float, length_s: int) -> None:
+def test_time_is_local_and_within_the_session(text: str, begins: float, length_s: int) -> None:
     found = time_spec.span_ns(text, NOON * S, (NOON + 13 * HOUR_S) * S, NOON + HOUR_S)
     assert found == (begins * S, (begins + length_s) * S)
 
@@ -54,7 +54,7 @@ def test_a_time_is_local_and_within_the_session(text: str, begins: float, length
         ("2026-11-25T10:00:00Z", HOUR_S),
     ],
 )
-def test_a_time_in_the_past_is_the_last_one(text: str, ago_s: float) -> None:
+def test_time_in_the_past_is_the_last_one(text: str, ago_s: float) -> None:
     assert time_spec.ago_s(text, NOON) == ago_s
 
 
@@ -83,7 +83,7 @@ def test_repeated_hour_is_ambiguous_and_missing_hour_refused() -> None:
             time_spec.ago_s("2:30", missing + 2 * HOUR_S)
 
 
-def test_a_time_of_day_on_two_days_names_both() -> None:
+def test_time_of_day_on_two_days_names_both() -> None:
     with pytest.raises(ValueError, match=r"2026-11-25 14:05, 2026-11-26 14:05"):
         time_spec.at_ns("14:05", NOON * S, (NOON + 2 * DAY_S) * S, NOON)
     assert time_spec.is_within("14:05", NOON * S, (NOON + 2 * DAY_S) * S, NOON)

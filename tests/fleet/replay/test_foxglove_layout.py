@@ -15,7 +15,7 @@ PATH = re.compile(r'(?:"(?P<quoted>[^"]+)"|(?P<plain>[A-Za-z0-9_/]+))(?P<fields>
 """The part of Foxglove's grammar of message paths that we use."""
 
 
-def test_the_file_is_what_the_tables_make() -> None:
+def test_file_is_what_the_tables_make() -> None:
     command = "python -m fleet.replay.foxglove_layout > deploy/foxglove.json"
     assert json.loads(FILE.read_text()) == foxglove_layout.layout(), command
 

@@ -84,7 +84,7 @@ def test_how_long_a_process_may_be_silent(sign: Sign, many: bool, may_move: bool
         (Sign.SPINNING, SLOW_SILENT_S),  # a hundred sessions reconnect to the hub at once
     ],
 )
-def test_a_hub_that_works_is_not_hung(sign: Sign, seconds: float) -> None:
+def test_hub_that_works_is_not_hung(sign: Sign, seconds: float) -> None:
     assert longest_hub_silence_s(sign) == seconds
 
 
@@ -97,14 +97,14 @@ def test_when_many_are_silent(silent: int, total: int, many: bool) -> None:
 
 
 @pytest.mark.parametrize("slept_s", [12.0, 3600.0, 1e6])
-def test_a_sleep_of_the_computer_is_no_hang(slept_s: float) -> None:
+def test_sleep_of_the_computer_is_no_hang(slept_s: float) -> None:
     """Where the machine's clock counts the sleep (Windows). Elsewhere it stands still, and so does this one."""
     clock = WatchClock(100.0)
     before = clock.advance(100.1)
     assert clock.advance(100.1 + slept_s) - before <= MAX_POLL_GAP_S
 
 
-def test_the_watchers_clock_stands_while_the_watcher_does() -> None:
+def test_watchers_clock_stands_while_the_watcher_does() -> None:
     clock, now = WatchClock(100.0), 100.0
     for _ in range(10):
         now += 0.1

@@ -93,7 +93,7 @@ def test_rejected_arguments_are_retried_each_minute_or_after_reload() -> None:
     ("leave_s", "act"),
     [(0.0, RestartAction.KILL), (4.9, RestartAction.KILL), (5.1, RestartAction.NOTHING), (inf, RestartAction.NOTHING)],
 )
-def test_a_silent_process_may_be_left_longer_than_its_patience(leave_s: float, act: RestartAction) -> None:
+def test_silent_process_may_be_left_longer_than_its_patience(leave_s: float, act: RestartAction) -> None:
     assert running(100.0).turn(105.0, 0.0, leave_s) is act
 
 

@@ -97,5 +97,5 @@ def test_if_it_does_not_come_nothing_was_shown(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_the_end_in_one_line(results: dict[str, str], words: str) -> None:
+def test_end_in_one_line(results: dict[str, str], words: str) -> None:
     assert describe_end(results) == words

@@ -39,7 +39,7 @@ cars:
 """
 
 
-def test_a_file_says_it_all(tmp_path: Path) -> None:
+def test_file_says_it_all(tmp_path: Path) -> None:
     spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), UpOptions())
     assert (spec.fleet, spec.endpoint, spec.record) == ("lab", "tcp/127.0.0.1:7999", True)
     assert (spec.recordings, spec.quota) == (tmp_path / "kept", Quota(20 * 10**9))
@@ -69,7 +69,7 @@ def test_cars_of_another_package_are_not_simulated(tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(("quota", "size"), [("20GB", 20e9), ("1 MB", 1e6), ("999999GB", 999_999e9), ("999TB", 999e12)])
-def test_the_recorder_takes_any_quota_and_place_of_a_file(quota: str, size: float, tmp_path: Path) -> None:
+def test_recorder_takes_any_quota_and_place_of_a_file(quota: str, size: float, tmp_path: Path) -> None:
     spec = build_spec(parse_fleet(FILE.replace("20GB", quota), tmp_path / "fleet.yaml"), UpOptions())
     interpreter, _, program, *words = recorder_command(spec, "tcp/127.0.0.1:7999")
     assert (interpreter, program, words[:2]) == (sys.executable, "fleet.cli", ["record", "run"])
@@ -112,7 +112,7 @@ def _people(arguments: tuple[str, ...]) -> list[str]:
     return list(arguments[arguments.index("--people-only") :]) if "--people-only" in arguments else []
 
 
-def test_the_command_line_wins(tmp_path: Path) -> None:
+def test_command_line_wins(tmp_path: Path) -> None:
     asked = UpOptions(plan=Path("p.yaml"), record=True, out=Path("o"), connect="tcp/127.0.0.1:7000", fleet="x")
     spec = build_spec(parse_fleet(FILE, tmp_path / "fleet.yaml"), asked)
     assert (spec.fleet, spec.endpoint, spec.record, spec.recordings, spec.plan) == (
@@ -136,7 +136,7 @@ def test_simulated_are_first_the_files_cars_then_ours(tmp_path: Path) -> None:
     assert one.cars["bob"].link == "tcp://192.168.1.7:8888"
 
 
-def test_a_simulated_car_keeps_the_options_of_its_platform(tmp_path: Path) -> None:
+def test_simulated_car_keeps_the_options_of_its_platform(tmp_path: Path) -> None:
     text = "cars: {ann: {link: COM3, platform: auto+text+head=BaLa}, bob: {link: COM4, platform: stm32+3s}}"
     spec = build_spec(parse_fleet(text, tmp_path / "fleet.yaml"), UpOptions(simulated=2))
     assert [car.platform for car in spec.simulated] == ["arduino+text+head=BaLa", "stm32+3s"]
@@ -197,7 +197,7 @@ def test_cars_come_go_and_change() -> None:
     assert found.words == ("bob is restarted", "eve is added", "ann is removed")
 
 
-def test_a_gateway_of_a_simulated_car_restarts_with_other_people() -> None:
+def test_gateway_of_a_simulated_car_restarts_with_other_people() -> None:
     car = replace(OLD.cars["sim"], arguments=("--people-only", "--person", "lee"))
     found = compare(OLD, replace(OLD, cars={**OLD.cars, "sim": car}))
     assert (found.restarted, found.words, found.spec.cars["sim"]) == (("sim",), ("sim is restarted",), car)

@@ -25,7 +25,7 @@ from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, wait_for
 
 
-def test_a_long_history_is_answered_in_slices(tmp_path: Path) -> None:
+def test_long_history_is_answered_in_slices(tmp_path: Path) -> None:
     """As JSON, a long history takes longer than a gateway may leave its car alone."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)
     try:

@@ -92,7 +92,7 @@ async def test_history_queries_have_own_bounded_queue(hall: tuple[Hall, bus.Bus]
     assert await there.doors.histories.next()
 
 
-async def test_a_stop_finds_room_where_other_commands_find_none(hall: tuple[Hall, bus.Bus]) -> None:
+async def test_stop_finds_room_where_other_commands_find_none(hall: tuple[Hall, bus.Bus]) -> None:
     there, asker = hall  # no receiver is attached yet
 
     def fill() -> list[str]:

@@ -7,7 +7,7 @@ from schemas.identity import person
 ANN, BOB = (keys.command_key("fleet", "red", "drive", person(name)) for name in ("ann", "bob"))
 
 
-def test_a_flood_takes_nothing_from_others() -> None:
+def test_flood_takes_nothing_from_others() -> None:
     budgets = SenderBudgets()
     passed = {ANN: 0, BOB: 0}
     for millisecond in range(10_000):
@@ -21,7 +21,7 @@ def test_a_flood_takes_nothing_from_others() -> None:
     assert budgets.dropped == 200_000 - passed[BOB]
 
 
-def test_a_wildcard_counts_as_any_other_key_of_its_identity() -> None:
+def test_wildcard_counts_as_any_other_key_of_its_identity() -> None:
     budgets = SenderBudgets()
     every = keys.command_key("fleet", "*", "drive", person("bob"))
     assert sum(budgets.take(key, "", 0.0) for key in (every, BOB) * DRIVES_AT_ONCE) == DRIVES_AT_ONCE
@@ -40,7 +40,7 @@ def test_sessions_of_an_identity_share_its_budget() -> None:
     assert sum(budgets.take(BOB, session, 0.0) for session in ("5e55", "5e56") * DRIVES_AT_ONCE) == DRIVES_AT_ONCE
 
 
-def test_the_memory_is_bounded() -> None:
+def test_memory_is_bounded() -> None:
     budgets = SenderBudgets()
     for number in range(10 * MAX_SENDERS):
         assert budgets.take(keys.command_key("fleet", "red", "drive", person(f"p{number}")), "", 0.0)

@@ -122,7 +122,7 @@ def test_noise_around_a_threshold_does_not_flap(seed: int) -> None:
 
 
 @given(st.integers(0, 2**32), st.sampled_from([7.6, 7.25, 6.85, 6.4]), st.booleans())
-def test_the_level_does_not_flap_from_the_first_reading_on(seed: int, rest_v: float, from_a_drive: bool) -> None:
+def test_level_does_not_flap_from_the_first_reading_on(seed: int, rest_v: float, from_a_drive: bool) -> None:
     """A gateway starts, sometimes while motors run. Once they stop, the voltage recovers. Some readings are damaged.
 
     From the first reading on the level only falls, never rises.
@@ -150,7 +150,7 @@ def test_readings_on_both_sides_of_critical_are_low_at_least() -> None:
     assert battery.level is BatteryLevel.LOW
 
 
-def test_a_policy_may_stop_or_only_warn() -> None:
+def test_policy_may_stop_or_only_warn() -> None:
     assert BatteryPolicy(critical=BatteryAction.STOP).action(BatteryLevel.CRITICAL) is BatteryAction.STOP
     warns = Battery(BatteryPolicy(critical=BatteryAction.WARN))
     hear(warns, *[6.0] * 6)
@@ -160,5 +160,5 @@ def test_a_policy_may_stop_or_only_warn() -> None:
     assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%. Charge it")
 
 
-def test_the_hold_outlasts_a_few_readings() -> None:
+def test_hold_outlasts_a_few_readings() -> None:
     assert LEVEL_DEBOUNCE_S > 3.0, "a report comes every one to two seconds"

@@ -103,7 +103,7 @@ def test_counters() -> None:
     assert health.airtime(200.0) == 1.0
 
 
-def test_a_change_is_told_once() -> None:
+def test_change_is_told_once() -> None:
     health = LinkHealth()
     health.on_open(1.0)
     health.on_reading(2.0)

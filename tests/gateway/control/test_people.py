@@ -217,7 +217,7 @@ def resumed(
         (People.parse(["ann"]), (LEAD,), "A person"),  # the table has no lead
     ],
 )
-def test_a_paused_car_says_who_ends_the_pause(people: People, ranks: tuple[Rank, ...], who: str) -> None:
+def test_paused_car_says_who_ends_the_pause(people: People, ranks: tuple[Rank, ...], who: str) -> None:
     pauses = tuple(FleetPause(f"p{at_ns}", "teacher@lab", "", at_ns, rank) for at_ns, rank in enumerate(ranks))
     at = replace(FREE, authority=Authority(people, pauses=pauses))
     reason, words = refused(Drive(Motion.FORWARD), SENDERS["person"], at)
@@ -273,7 +273,7 @@ def test_pause_stops_like_a_stop_and_only_leads_drive(desk: Workbench) -> None:
     assert [log.code for log in desk.logs] == ["paused", "unpaused", "hold_ended"]
 
 
-def test_a_refused_pause_stops_nothing(desk: Workbench) -> None:
+def test_refused_pause_stops_nothing(desk: Workbench) -> None:
     desk.ask(FORWARD, ANN)
     assert desk.ask(Pause(), BOB).reason is Reason.NOT_ALLOWED
     desk.run(1.0)
@@ -346,7 +346,7 @@ def test_only_lead_ends_hold_of_lead(desk: Workbench) -> None:
     assert desk.control.safety.hold is None
 
 
-def test_a_table_without_leads_keeps_no_car_stopped_for_ever() -> None:
+def test_table_without_leads_keeps_no_car_stopped_for_ever() -> None:
     kept = PersistedSafety(Hold("teacher@lab", 1, LEAD), (Estop("e1", "teacher@lab", "", 1, True, LEAD),))
     desk = Workbench(kept=kept, people=People.parse(["ann"])).ready()
     assert desk.ask(Resume(all=True), ANN).reason is None

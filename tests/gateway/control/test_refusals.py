@@ -193,7 +193,7 @@ def test_actions_that_move_parts_need_lease() -> None:
     assert {type(what) for what in parts} - without == {MoveServo, AimServo, MoveArm, ChangeSpeed, Fan}
 
 
-def test_the_table_has_every_command() -> None:
+def test_table_has_every_command() -> None:
     others = {type(what) for what in (*WHATS, *DIRECTIONS) if not isinstance(what, PartAction)}
     assert others == set(TABLE)
     for what in (*WHATS, *DIRECTIONS):

@@ -31,7 +31,7 @@ def test_every_state_answers_every_event() -> None:
 
 
 @each_transition
-def test_a_transition(state: CarTrust, event: TrustEvent) -> None:
+def test_transition(state: CarTrust, event: TrustEvent) -> None:
     after = TRANSITIONS[state, event]
     if event is TrustEvent.LINK_LOST:
         assert after is CarTrust.UNKNOWN
@@ -73,7 +73,7 @@ def test_trust_transitions_state_motors_and_basis(state: CarTrust, event: TrustE
         assert trust.basis is ENDS_A_STOP[event]
 
 
-def test_an_event_is_its_own_evidence() -> None:
+def test_event_is_its_own_evidence() -> None:
     trust = TrustState()
     assert trust.evidence == "not connected yet"
     trust.apply(TrustEvent.LINK_OPENED, 1.0)

@@ -22,7 +22,7 @@ def test_objects_end_at_their_mark_in_any_pieces(pieces: list[bytes]) -> None:
     assert LineSplitter(end=b"}").feed(b'{"a":1}{_ok}\r\n{"b"') == [b'{"a":1}', b"{_ok}"]
 
 
-def test_an_unfinished_line_waits_and_is_taken_once() -> None:
+def test_unfinished_line_waits_and_is_taken_once() -> None:
     lines = LineSplitter()
     assert lines.feed(b'{"a":1}\r\n\r\n{"b"') == [b'{"a":1}']
     assert lines.take_rest() == b'{"b"'

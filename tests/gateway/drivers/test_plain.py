@@ -79,7 +79,7 @@ def test_speed_change_applies_at_once_while_driving(bench: TankBench) -> None:
     assert bench.moves()[-1] == [0.4, 0.4]
 
 
-def test_a_change_of_speed_behind_a_stop_drives_nothing(bench: TankBench) -> None:
+def test_change_of_speed_behind_a_stop_drives_nothing(bench: TankBench) -> None:
     bench.ask(Drive(Motion.FORWARD, 5.0))
     bench.run(0.4)
     stopped_at = bench.now
@@ -93,7 +93,7 @@ def test_a_change_of_speed_behind_a_stop_drives_nothing(bench: TankBench) -> Non
     assert bench.control.driver.model.at_rest
 
 
-def test_a_silent_car_is_stopped_again_and_again(bench: TankBench) -> None:
+def test_silent_car_is_stopped_again_and_again(bench: TankBench) -> None:
     bench.reports = False
     bench.run(3.0)
     assert bench.control.driver.model.trust.state is CarTrust.UNHEARD

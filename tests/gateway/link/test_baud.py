@@ -50,7 +50,7 @@ def test_baud_detection_reads_line_at_right_rate() -> None:
 
 
 @pytest.mark.parametrize("rate", [38400, 57600, 115200])
-def test_a_port_that_is_too_fast_is_recognized(rate: int) -> None:
+def test_port_that_is_too_fast_is_recognized(rate: int) -> None:
     data = received(REPORT * 10, sent_at=9600, read_at=rate)
     found = doubt(data, parse_url(f"serial:///dev/ttyUSB0?baud={rate}"))
     assert found is not None
@@ -68,7 +68,7 @@ def test_other_wrong_rates_are_doubted(car: int, port: int) -> None:
     assert f" {port} baud" in found[1]
 
 
-def test_the_bytes_that_people_see() -> None:
+def test_bytes_that_people_see() -> None:
     for url, words in (
         ("/dev/ttyUSB0", "The port is at 9600 baud: does this car use another one (?baud=115200)?"),
         ("serial://?vid=1a86&baud=57600", "The port is at 57600 baud: cars use 9600."),
@@ -89,7 +89,7 @@ def test_baud_detection_trusts_text_few_bytes_and_frames() -> None:
     assert watch.on_bytes(bytes(10 * MIN_BYTES)) is None, "noise on a line that works"
 
 
-def test_a_line_of_text_between_frames_is_no_damage(tmp_path: Path) -> None:
+def test_line_of_text_between_frames_is_no_damage(tmp_path: Path) -> None:
     """Some programs print a line after each general frame."""
     peer = PtyPeer(tmp_path)
     started = FleetProcesses(free_endpoint(), tmp_path)
@@ -105,7 +105,7 @@ def test_a_line_of_text_between_frames_is_no_damage(tmp_path: Path) -> None:
         peer.close()
 
 
-def test_a_gateway_says_it(tmp_path: Path) -> None:
+def test_gateway_says_it(tmp_path: Path) -> None:
     peer = PtyPeer(tmp_path)
     started = FleetProcesses(free_endpoint(), tmp_path)
     try:

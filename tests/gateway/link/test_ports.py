@@ -115,7 +115,7 @@ async def test_hidden_second_program_is_found_with_a_command(
     await link.close()
 
 
-async def test_an_unplugged_port_is_no_second_program(peer: PtyPeer) -> None:
+async def test_unplugged_port_is_no_second_program(peer: PtyPeer) -> None:
     link = await open_link(peer.url)
     peer.die()
     async with asyncio.timeout(PATIENCE_S):
@@ -142,7 +142,7 @@ async def test_program_with_open_port_is_found_on_request(peer: PtyPeer, tmp_pat
     await link.close()
 
 
-def test_a_gateway_says_which_program_takes_the_bytes(tmp_path: Path) -> None:
+def test_gateway_says_which_program_takes_the_bytes(tmp_path: Path) -> None:
     started = FleetProcesses(free_endpoint(), tmp_path)
     try:
         _, (link,) = started.simulate("red:arduino:pty")
@@ -210,7 +210,7 @@ async def refused(url: SerialUrl | UsbUrl) -> str:
     return str(caught.value)
 
 
-async def test_a_ch340_without_a_port_is_said_and_brltty_named(adapter: Path, tmp_path: Path) -> None:
+async def test_ch340_without_a_port_is_said_and_brltty_named(adapter: Path, tmp_path: Path) -> None:
     missing = SerialUrl(str(tmp_path / "ttyUSB0"))
     assert "brltty" not in await refused(missing), "the adapter has its port"
     adapter.rmdir()  # noqa: ASYNC240 - nothing else runs in this loop

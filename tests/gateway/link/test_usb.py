@@ -86,7 +86,7 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return listed
 
 
-async def test_a_device_that_comes_back_under_another_number_is_found(tmp_path: Path, plug: Usb) -> None:
+async def test_device_that_comes_back_under_another_number_is_found(tmp_path: Path, plug: Usb) -> None:
     (tmp_path / "ACM0").mkdir()
     (tmp_path / "ACM1").mkdir()
     first, second = PtyPeer(tmp_path / "ACM0"), PtyPeer(tmp_path / "ACM1")
@@ -129,7 +129,7 @@ async def test_device_vanishing_during_listing_costs_one_try(
     peer.close()
 
 
-async def test_a_listing_that_fails_once_is_asked_for_again(
+async def test_listing_that_fails_once_is_asked_for_again(
     tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peer = PtyPeer(tmp_path)
@@ -163,7 +163,7 @@ async def test_other_usb_device_in_same_place_is_not_opened(named: str, tmp_path
     peer.close()
 
 
-async def test_a_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Usb) -> None:
+async def test_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Usb) -> None:
     """The path is gone, or leads to a device that the system does not describe."""
     peer = PtyPeer(tmp_path)
     plug(UsbSerialPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))

@@ -73,14 +73,14 @@ def test_every_field() -> None:
     assert spec.world().lively
 
 
-def test_the_room_of_the_file_is_the_room() -> None:
+def test_room_of_the_file_is_the_room() -> None:
     spec, room = read_world((WORLDS / "room.yaml").read_text(), "room"), World.room()
     world = spec.world()
     assert (world.walls, world.line, world.lively) == (room.walls, room.line, False)
     assert [world.start_pose(index, "red") for index in range(9)] == [room.start_pose(index) for index in range(9)]
 
 
-def test_the_follow_world_begins_with_room_for_all() -> None:
+def test_follow_world_begins_with_room_for_all() -> None:
     spec = read_world((WORLDS / "follow.yaml").read_text(), "follow", ["red", "green", "blue"])
     assert list(spec.starts) == ["red", "green", "blue"]
     assert spec.cars_meet
@@ -118,7 +118,7 @@ LIMITS = [
 ]
 
 
-def test_the_schema_for_editors_accepts_what_the_reader_accepts() -> None:
+def test_schema_for_editors_accepts_what_the_reader_accepts() -> None:
     for text in (EVERYTHING, *(path.read_text() for path in WORLDS.glob("*.yaml"))):
         read_yaml(text, "w.yaml", WorldEntry)
     for text, limit in LIMITS:
@@ -240,7 +240,7 @@ def test_faults(text: str, faults: list[str]) -> None:
         assert words in line
 
 
-def test_a_fault_causes_no_second_one() -> None:
+def test_fault_causes_no_second_one() -> None:
     text = EVERYTHING.replace("x_m: -0.1, radius_m", "x_m: far, radius_m").replace("-1, heading", "north, heading")
     text = text.replace("depth_m: 0x04", "depth_m: 0").replace("carried_by: cart", "carried_by: CART")
     with pytest.raises(BadFile) as error:

@@ -161,7 +161,7 @@ def test_missing_link_fails_and_others_are_shown(command: Command, simulate: Cal
     assert done.stderr.endswith(" serial:///dev/nope\n")
 
 
-def test_a_device_that_goes_away_while_it_is_listened_to(start: Started) -> None:
+def test_device_that_goes_away_while_it_is_listened_to(start: Started) -> None:
     controller, device = pty.openpty()
     scan = start("scan", "--json", "--link", os.ttyname(device), "--for", "100")
     wait_for(lambda: not termios.tcgetattr(device)[3] & termios.ICANON, "the port is being opened")
@@ -176,7 +176,7 @@ def test_a_device_that_goes_away_while_it_is_listened_to(start: Started) -> None
     assert scan.wait() == 1
 
 
-def test_a_tcp_car_is_named_and_warned_of(command: Command) -> None:
+def test_tcp_car_is_named_and_warned_of(command: Command) -> None:
     car = TcpCar()
     try:
         found, done = _scan(command, car.link, more=("--for", "1"))
@@ -228,7 +228,7 @@ def _port(device: str, **known: Any) -> ListPortInfo:
     return port
 
 
-def test_the_url_of_a_port_is_the_one_that_lasts() -> None:
+def test_url_of_a_port_is_the_one_that_lasts() -> None:
     uno = {"vid": 0x2341, "pid": 0x0043, "serial_number": "75 3/5", "description": "Arduino Uno"}
     clone = {"vid": 0x1A86, "pid": 0x7523, "serial_number": None}
     twins = {"vid": 0x10C4, "pid": 0xEA60, "serial_number": "0001"}

@@ -18,7 +18,7 @@ STOP = "$0,0,0,0,0,0,0,0,0#"
 RUN = "$1,0,0,0,0,0,0,0,0#"
 
 
-def test_a_car_drives_until_it_is_stopped_as_it_says(simulate: Callable[..., Any], command: Command) -> None:
+def test_car_drives_until_it_is_stopped_as_it_says(simulate: Callable[..., Any], command: Command) -> None:
     sim, [link] = simulate("red:arduino:pty")
     wait_for(lambda: sim.say({"car": "red", "ask": "truth"})["mode"] == "manual", "the car has started")
     done = command("send", "--link", link, "--wait", "1", RUN)
@@ -36,7 +36,7 @@ def test_a_car_drives_until_it_is_stopped_as_it_says(simulate: Callable[..., Any
     wait_for(lambda: not driving(sim), "the car stands")
 
 
-def test_a_mode_is_opened_and_closed_as_it_says(simulate: Callable[..., Any], command: Command) -> None:
+def test_mode_is_opened_and_closed_as_it_says(simulate: Callable[..., Any], command: Command) -> None:
     sim, [link] = simulate("red:arduino:pty")
     done = command("send", "--link", link, "--platform", "arduino", "--wait", "1", "$4WD,MODE21#")
     assert done.returncode == 0
@@ -112,7 +112,7 @@ def test_send_refusals_open_no_link(command: Command, arguments: list[str], word
     assert done.stdout == ""
 
 
-def test_a_link_that_cannot_be_had_is_one_line(command: Command) -> None:
+def test_link_that_cannot_be_had_is_one_line(command: Command) -> None:
     done = command("send", "--link", "/dev/nope", STOP)
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1

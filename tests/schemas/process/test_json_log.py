@@ -23,7 +23,7 @@ def test_json_log_line_is_one_object_whatever_its_texts() -> None:
     assert found["time"].endswith("+00:00")
 
 
-def test_the_supervisor_reads_the_words_of_such_a_line() -> None:
+def test_supervisor_reads_the_words_of_such_a_line() -> None:
     assert message_in(line_of("no link", level=logging.ERROR)) == ("ERROR", "no link")
     assert message_in(line_of("no link", level=logging.WARNING)) == ("WARNING", "no link")
     assert message_in(line_of("bye", level=logging.WARNING, stream="stderr")) == ("ERROR", "bye")

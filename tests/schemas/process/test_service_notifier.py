@@ -67,7 +67,7 @@ def test_without_a_watchdog_it_is_ready_once(watchdog: dict[str, str], manager: 
     notifier.close()
 
 
-def test_the_process_that_is_named_is_watched(manager: socket.socket) -> None:
+def test_process_that_is_named_is_watched(manager: socket.socket) -> None:
     watchdog = {WATCHDOG_USEC: SECONDS, WATCHDOG_PID: str(os.getpid())}
     notifier = ServiceNotifier({NOTIFY_SOCKET: manager.getsockname(), **watchdog})
     notifier.feed(1.0)
@@ -75,7 +75,7 @@ def test_the_process_that_is_named_is_watched(manager: socket.socket) -> None:
     notifier.close()
 
 
-def test_an_abstract_socket_is_one() -> None:
+def test_abstract_socket_is_one() -> None:
     name = f"fleet-notify-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
         bound.bind(f"\0{name}")

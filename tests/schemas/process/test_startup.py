@@ -39,7 +39,7 @@ RUN = ("run", "--car", "red", "--link", "tcp://127.0.0.1:9", "--connect", "tcp/1
         ("fleet", "fleet.policy.lint.lint", ("check", "pyproject.toml")),
     ],
 )
-def test_an_interrupt_during_an_import_is_no_traceback(package: str, imported: str, arguments: tuple[str, ...]) -> None:
+def test_interrupt_during_an_import_is_no_traceback(package: str, imported: str, arguments: tuple[str, ...]) -> None:
     program = AT_IMPORT.format(package=package)
     done = subprocess.run(
         [sys.executable, "-c", program, imported, *arguments], capture_output=True, text=True, check=False, timeout=60
@@ -48,7 +48,7 @@ def test_an_interrupt_during_an_import_is_no_traceback(package: str, imported: s
 
 
 @pytest.mark.parametrize(("package", "arguments"), [("fleet", ("example", "list")), ("gateway", NOWHERE)])
-def test_an_interrupt_during_the_exit_is_no_traceback(package: str, arguments: tuple[str, ...]) -> None:
+def test_interrupt_during_the_exit_is_no_traceback(package: str, arguments: tuple[str, ...]) -> None:
     command = [sys.executable, "-c", AT_EXIT.format(package=package), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 130

@@ -35,7 +35,7 @@ class Computer:
 
 
 @pytest.mark.parametrize("slept_s", [MIN_SLEEP_S + 0.01, 1.0, 12.0, 3600.0, 1e6])
-def test_a_sleep_is_told_once(slept_s: float) -> None:
+def test_sleep_is_told_once(slept_s: float) -> None:
     computer = Computer()
     watch = computer.watch()
     assert watch.take() == 0
@@ -53,7 +53,7 @@ def test_time_that_passes_awake_is_no_sleep() -> None:
 
 
 @pytest.mark.parametrize("seed", range(50))
-def test_an_interruption_is_no_sleep_and_hides_none_for_long(seed: int) -> None:
+def test_interruption_is_no_sleep_and_hides_none_for_long(seed: int) -> None:
     draw = random.Random(seed)
     computer = Computer()
     computer.interrupts = [draw.choice((1e-6, 3.0)) for _ in range(3 * draw.randrange(MAX_READS))]
@@ -76,7 +76,7 @@ def test_without_clocks_nothing_is_told() -> None:
 
 
 @pytest.mark.skipif(sys.platform not in ("linux", "darwin", "win32"), reason="no sleep is noticed on this system")
-def test_the_clocks_of_this_system_agree_while_it_is_awake() -> None:
+def test_clocks_of_this_system_agree_while_it_is_awake() -> None:
     clocks = clock_pair()
     assert clocks is not None
     with_sleep, awake = clocks
@@ -87,7 +87,7 @@ def test_the_clocks_of_this_system_agree_while_it_is_awake() -> None:
         assert watch.take() == 0
 
 
-def test_a_process_that_is_stopped_has_not_slept() -> None:
+def test_process_that_is_stopped_has_not_slept() -> None:
     """The clocks of the system are the point here, so it is a real process."""
     program = """
         import sys

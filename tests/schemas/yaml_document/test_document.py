@@ -107,7 +107,7 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     ],
     ids=["aliases", "a circle", "brackets", "mappings", "size"],
 )
-def test_a_bomb_is_a_fault(text: str, words: str) -> None:
+def test_bomb_is_a_fault(text: str, words: str) -> None:
     (line,) = _faults(text)
     assert words in line
 
@@ -119,7 +119,7 @@ def test_no_more_faults_are_told_than_somebody_reads() -> None:
     assert lines[-1].endswith(": error: and 30 more")
 
 
-def test_a_file_that_is_no_text(tmp_path: Path) -> None:
+def test_file_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "f.yaml"
     path.write_bytes(b"wheels: {}\nmode: caf\xe9\n")
     with pytest.raises(BadFile, match=r"f\.yaml:2:10: error: byte 0xe9 is not UTF-8"):
@@ -134,7 +134,7 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     assert read_yaml(read_text(path), "f", Wagon).mode == "fast"
 
 
-def test_a_dangling_link_is_not_suggested_instead_of_itself(tmp_path: Path) -> None:
+def test_dangling_link_is_not_suggested_instead_of_itself(tmp_path: Path) -> None:
     (tmp_path / "plan.yaml").symlink_to(tmp_path / "gone.yaml")
     with pytest.raises(BadFile, match=r"plan\.yaml: error: .* file$"):
         read_text(tmp_path / "plan.yaml")

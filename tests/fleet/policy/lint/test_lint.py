@@ -274,7 +274,7 @@ def test_named_absent_car_without_fleet_file_is_warning() -> None:
     assert "role ghost: " in find_faults(BROKEN).refusal(), "what no car could do is refused anyway"
 
 
-def test_a_misspelled_word_for_cars_is_an_error_once() -> None:
+def test_misspelled_word_for_cars_is_an_error_once() -> None:
     plan = parse(SCOUT + "rules: [{when: line.left_outer, then: {who: this_cars, mode: manual}}]")
     for cars in (None, FLEET):
         (error,) = find_faults(plan, cars, {"red"}).errors

@@ -14,7 +14,7 @@ from tests.support.text_parts import has_parts
 
 
 @pytest.mark.parametrize("path", sorted((EXAMPLES / "plans").glob("*.yaml")), ids=lambda path: path.name)
-def test_the_example_plans_are_plans(path: Path) -> None:
+def test_example_plans_are_plans(path: Path) -> None:
     plan = parse(path.read_text(encoding="utf-8"))
     assert plan.roles
     assert check(plan) == ()

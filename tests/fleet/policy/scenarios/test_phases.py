@@ -76,7 +76,7 @@ def test_phase_and_rules_last_one_run_and_roles_longer(tmp_path: Path, monkeypat
     assert CoordinatorStateFile("fleet", "tcp/y", "run-1").load() == PersistedPolicy()
 
 
-def test_a_restarted_plan_begins_with_its_first_phase() -> None:
+def test_restarted_plan_begins_with_its_first_phase() -> None:
     run = PolicyRun(PLAN, "red")
     run.until(12.0)
     run.memory, words = on_request(PlanRequest.RESTART, PLAN, run.memory, "ann", 12.1)

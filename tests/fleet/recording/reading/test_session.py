@@ -25,7 +25,7 @@ def mcap(*sequences: int) -> bytes:
     return out.getvalue()
 
 
-def test_a_file_that_is_none_hides_no_other(tmp_path: Path) -> None:
+def test_file_that_is_none_hides_no_other(tmp_path: Path) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1, 2))
     (tmp_path / "0002.mcap").write_bytes(b"")
     (tmp_path / "0003.mcap").mkdir()
@@ -63,7 +63,7 @@ WRONG = [
 @pytest.mark.parametrize(
     "text", ["", "[]", "null", "7", '{"format": "2"}', '{"format": null}', "\0", '{"fleet": 1}', *WRONG]
 )
-def test_a_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text: str) -> None:
+def test_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text: str) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1))
     (tmp_path / "session.json").write_text(text)
     session = Session(tmp_path)
@@ -71,7 +71,7 @@ def test_a_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text
     assert [message.sequence for message in session.messages()] == [1]
 
 
-def test_a_description_that_is_a_device_is_not_waited_for(tmp_path: Path) -> None:
+def test_description_that_is_a_device_is_not_waited_for(tmp_path: Path) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1))
     os.mkfifo(tmp_path / "session.json")
     assert Session(tmp_path).description is None
@@ -91,7 +91,7 @@ def test_no_session_error_names_path_and_reason(content: bytes | None, words: st
     assert "\n" not in str(caught.value)
 
 
-def test_an_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> None:
+def test_empty_directory_and_a_newer_format_are_refused(tmp_path: Path) -> None:
     with pytest.raises(NoSession, match=r"no 0001\.mcap"):
         Session(tmp_path)
     (tmp_path / "0001.mcap").write_bytes(mcap(1))

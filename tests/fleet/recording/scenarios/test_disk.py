@@ -236,7 +236,7 @@ def test_backlog_is_written_as_room_allows(tmp_path: Path) -> None:
         assert times == [BEGUN_NS + second * SECOND_NS + number for second in range(3) for number in range(500)]
 
 
-def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     process = record(endpoint, tmp_path, "--quota", "1MB")
     session = ready(process)
     out = publisher(bus, "red", "frame/rx")
@@ -259,7 +259,7 @@ def test_a_quota_alone_keeps_what_it_says(endpoint: str, bus: Bus, tmp_path: Pat
     assert all(verify(Session(path)).whole for path in tmp_path.iterdir() if path.is_dir())
 
 
-def test_a_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     states: list[str] = []
     bus.subscribe("fleet/@recorder/status", lambda sample: states.append(sample.message().state))  # type: ignore[attr-defined]
     process = record(endpoint, tmp_path / "sessions")
@@ -273,7 +273,7 @@ def test_a_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, 
     wait_for(lambda: "failed" in states, "that on the bus")
 
 
-def test_a_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
+def test_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     process = record(endpoint, tmp_path / "file" / "sessions")
     _, errors = process.communicate(timeout=60)
@@ -310,7 +310,7 @@ def test_recorder_stop_start_and_mark_over_bus(endpoint: str, bus: Bus, tmp_path
     assert marks[0].message == "foxglove.Log"
 
 
-def test_a_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_mark_that_cannot_be_is_refused(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     process = record(endpoint, tmp_path)
     ready(process)
     for payload in (b"", b"{", b"[]", b'{"text": 3}', b'{"text": ""}', b'{"text": "x", "by": 1}', b"\xff"):

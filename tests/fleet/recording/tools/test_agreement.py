@@ -41,7 +41,7 @@ def asked(command: str, path: Path) -> tuple[int, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("options", WRITERS)
-def test_a_file_without_an_index_is_whole(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_file_without_an_index_is_whole(tmp_path: Path, options: dict[str, Any]) -> None:
     path = write(tmp_path / "x.mcap", **options)
     (code, info), (verified, verdict) = asked("info", path), asked("verify", path)
     assert (code, info["state"], info["messages"], info["keys"]) == (0, SessionState.WHOLE, 10, {RANGE: 10})
@@ -49,7 +49,7 @@ def test_a_file_without_an_index_is_whole(tmp_path: Path, options: dict[str, Any
 
 
 @pytest.mark.parametrize("options", WRITERS)
-def test_a_cut_file_is_cut_for_both(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_cut_file_is_cut_for_both(tmp_path: Path, options: dict[str, Any]) -> None:
     path = write(tmp_path / "x.mcap", chunk_size=100, **options)
     path.write_bytes(path.read_bytes()[:-9])
     session = Session(path)

@@ -88,7 +88,7 @@ def test_join_takes_latest_fresh_value_of_same_car(made: Made, tmp_path: Path) -
         session.joined("sensor/range", "state/mode", tolerance_s=-1)
 
 
-def test_the_request_of_a_command_has_columns(made: Made, tmp_path: Path) -> None:
+def test_request_of_a_command_has_columns(made: Made, tmp_path: Path) -> None:
     requests = [
         (
             "drive",
@@ -142,7 +142,7 @@ def test_messages_are_decoded_to_readings(made: Made, tmp_path: Path) -> None:
         ("purple/sensor/range", "session-0.1 has no messages of purple/sensor/range."),
     ],
 )
-def test_a_name_that_is_no_table_says_which_are(name: str, words: str) -> None:
+def test_name_that_is_no_table_says_which_are(name: str, words: str) -> None:
     with pytest.raises(NoTable, match=words.replace(".", r"\.")):
         Session(OLD).to_arrow(name)
 
@@ -154,7 +154,7 @@ def test_wrong_topic_name_suggests_topic() -> None:
     assert "sensor/obstacle" not in str(refused.value)
 
 
-def test_a_topic_without_messages_is_an_empty_table() -> None:
+def test_topic_without_messages_is_an_empty_table() -> None:
     assert Session(OLD).to_arrow("sensor/arm").num_rows == 0
     assert "joint_deg" in Session(OLD).to_pandas("sensor/arm").columns
 
@@ -168,7 +168,7 @@ def test_without_the_extra_the_error_says_what_to_type(package: str, monkeypatch
     assert isinstance(error.value, ImportError)
 
 
-def test_the_newest_session_needs_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newest_session_needs_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(NoSession, match=r"No recordings here yet \(in sessions\)"):
         Session()
@@ -185,7 +185,7 @@ def test_the_newest_session_needs_no_name(tmp_path: Path, monkeypatch: pytest.Mo
         Session("s5")
 
 
-def test_the_example_plots_distance_over_time(tmp_path: Path) -> None:
+def test_example_plots_distance_over_time(tmp_path: Path) -> None:
     mpl.use("Agg")
     distance_over_time.main(str(OLD), "red", str(tmp_path / "distance.png"))
     assert (tmp_path / "distance.png").read_bytes().startswith(b"\x89PNG")

@@ -61,7 +61,7 @@ def test_recover_cut_and_rescue_keep_attachments_and_metadata(tmp_path: Path, op
     assert found_in(tmp_path / "rescued.mcap") == WHOLE
 
 
-def test_a_copy_of_a_copy_has_each_once(tmp_path: Path) -> None:
+def test_copy_of_a_copy_has_each_once(tmp_path: Path) -> None:
     write(tmp_path / "0001.mcap")
     write(tmp_path / "0002.mcap")
     recover(Session(tmp_path), tmp_path / "once")
@@ -69,7 +69,7 @@ def test_a_copy_of_a_copy_has_each_once(tmp_path: Path) -> None:
     assert found_in(tmp_path / "twice" / "0001.mcap") == WHOLE
 
 
-def test_a_cut_file_keeps_what_is_whole(tmp_path: Path) -> None:
+def test_cut_file_keeps_what_is_whole(tmp_path: Path) -> None:
     write(path := tmp_path / "x.mcap", chunk_size=1)
     data = path.read_bytes()
     path.write_bytes(data[: data.index(PICTURE) + len(PICTURE) + 4])
@@ -78,7 +78,7 @@ def test_a_cut_file_keeps_what_is_whole(tmp_path: Path) -> None:
     assert found_in(tmp_path / "recovered" / "0001.mcap") == WHOLE
 
 
-def test_a_damaged_attachment_is_named_and_not_copied(tmp_path: Path) -> None:
+def test_damaged_attachment_is_named_and_not_copied(tmp_path: Path) -> None:
     write(path := tmp_path / "x.mcap")
     data = bytearray(path.read_bytes())
     data[data.index(PICTURE) + 3] ^= 1

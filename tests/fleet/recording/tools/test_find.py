@@ -56,7 +56,7 @@ def distances(*rows: tuple[float, float | None]) -> list[tuple[float, str, dict[
     return [(at_s, "range", {} if value is None else {"range_m": value}) for at_s, value in rows]
 
 
-def test_a_hit_lasts_from_its_first_reading_to_its_last() -> None:
+def test_hit_lasts_from_its_first_reading_to_its_last() -> None:
     rows = distances((0, 1.0), (1, 0.2), (2, 0.1), (3, 1.0), (4, 0.2), (5, 1.0))
     assert spans(NEAR, rows) == [(1, 2), (4, 4)]
     assert spans(NEAR, rows, for_s=1.0) == [(1, 2)]
@@ -188,7 +188,7 @@ def test_live_and_from_disk_the_hits_are_the_same(seed: int, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("text", ["rang_m < 1", "range_m <", "range_m < 'a'", "left", "range_m < 0"])
-def test_a_bad_condition_is_refused_before_anything_is_read(text: str) -> None:
+def test_bad_condition_is_refused_before_anything_is_read(text: str) -> None:
     with pytest.raises(BadExpression):
         parse_condition(text)
     assert in_process.fleet("find", text, "/").returncode == 2
@@ -291,7 +291,7 @@ def test_recorded_names_become_no_command_and_no_terminal_flood(name: str, tmp_p
     assert shlex.split(command) == ["fleet", "replay", str(tmp_path / "a.mcap"), "--from", shlex.split(command)[-1]]
 
 
-def test_a_recorder_whose_clock_differs_has_hits_on_its_clock(tmp_path: Path) -> None:
+def test_recorder_whose_clock_differs_has_hits_on_its_clock(tmp_path: Path) -> None:
     made = Made(tmp_path / "a.mcap", Writer)
     for second in range(10):
         message = pb.Range(range_m=0.1 if second in (4, 5) else 1.0, car="red", seq=second + 1, boot_id="b")
@@ -320,7 +320,7 @@ def test_owner_conditions_match_person_names(condition: str, is_found: bool, tmp
     assert wait.ends(reading, reading.time, 1.0) is is_found
 
 
-def test_a_condition_that_held_for_too_short_reads_so(sessions: Path) -> None:
+def test_condition_that_held_for_too_short_reads_so(sessions: Path) -> None:
     assert "but for 2.0s" in find(NEAR, sessions, "--for", "5s").stderr
 
 

@@ -92,7 +92,7 @@ def test_lane_spans_of_each_topic(
     assert {each.lane for each in lanes.since(0)} <= {lane}
 
 
-def test_a_car_that_is_not_heard_any_more_is_lost_until_now() -> None:
+def test_car_that_is_not_heard_any_more_is_lost_until_now() -> None:
     lanes = Lanes()
     for car, last_s in (("red", 4), ("blue", 9)):
         lanes.add(car, LINK, pb.Link(state="online"), 0)
@@ -119,7 +119,7 @@ def test_later_span_wins_at_shared_boundary() -> None:
     }
 
 
-def test_the_oldest_spans_are_forgotten() -> None:
+def test_oldest_spans_are_forgotten() -> None:
     lanes = Lanes()
     for at_s in range(MAX_SPANS + 10):
         lanes.add("red", MODE, mode("manual" if at_s % 2 else "tracking"), at_s * S)

@@ -98,7 +98,7 @@ def test_nothing_is_overwritten(whole: Session, tmp_path: Path) -> None:
         merge([whole, whole], tmp_path / "out")
 
 
-def test_the_command(whole: Session, tmp_path: Path) -> None:
+def test_command(whole: Session, tmp_path: Path) -> None:
     cut(whole, tmp_path / "again", EVERYTHING)
     arguments = ["sessions", "merge", str(whole.path), str(tmp_path / "again"), "--out", str(tmp_path / "out")]
     done = CliRunner().invoke(cli, arguments)

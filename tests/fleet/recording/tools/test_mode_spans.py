@@ -29,7 +29,7 @@ MANUAL = ("manual", "manual", "confirmed")
 TRACKING = ("tracking", "tracking", "confirmed")
 
 
-def test_a_span_lasts_until_the_next_mode() -> None:
+def test_span_lasts_until_the_next_mode() -> None:
     rows = states((0, *MANUAL), (1, *AVOIDING), (2, *AVOIDING), (3.5, *MANUAL), (4, *MANUAL))
     assert list(mode_spans(rows)) == [
         ModeSpan("red", Mode.MANUAL, 0, S),
@@ -98,7 +98,7 @@ def session(tmp_path: Path) -> Session:
     return Session(tmp_path)
 
 
-def test_a_reading_has_the_mode_as_commanded_and_as_seen(session: Session) -> None:
+def test_reading_has_the_mode_as_commanded_and_as_seen(session: Session) -> None:
     with pytest.warns(UserWarning, match=r"sensor/range does not exist in some modes.*: red 3\.0 s in obstacle_avoid"):
         table = session.joined("sensor/range", "state/mode")
     assert set(table["mode"]) == set(table["mode_seen"]) == {"manual"}
@@ -110,7 +110,7 @@ def test_a_reading_has_the_mode_as_commanded_and_as_seen(session: Session) -> No
     assert "mode" not in session.joined("sensor/range", "sensor/battery").columns
 
 
-def test_the_times_without_a_reading_are_a_table(session: Session) -> None:
+def test_times_without_a_reading_are_a_table(session: Session) -> None:
     table = session.times_without("sensor/range")
     assert list(table.columns) == ["car", "mode", "begin", "end"]
     (row,) = table.itertuples()

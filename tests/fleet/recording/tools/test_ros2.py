@@ -68,7 +68,7 @@ def write(path: Path, *rows: tuple[str, str, dict[str, Any]]) -> Path:
 @pytest.mark.parametrize(
     ("fields", "metres"), [({"range_m": 1.25}, 1.25), ({"no_echo": True}, math.inf), ({}, math.nan)]
 )
-def test_a_distance_that_was_not_measured_is_none(fields: dict[str, Any], metres: float, tmp_path: Path) -> None:
+def test_distance_that_was_not_measured_is_none(fields: dict[str, Any], metres: float, tmp_path: Path) -> None:
     path = write(tmp_path / "one.mcap", ("fleet/red/sensor/range", "fleet.v1.Range", fields))
     write_bag(Session(path).rows(), tmp_path / "bag")
     ((topic, _, _, message),) = read(tmp_path / "bag")
@@ -131,7 +131,7 @@ def test_keys_with_one_name_are_topics_of_their_own(tmp_path: Path) -> None:
     assert sorted(topic for topic, *_ in read(tmp_path / "bag")) == ["/a_b/range", "/a_b/range_2"]
 
 
-def test_the_command_writes_a_new_directory(tmp_path: Path) -> None:
+def test_command_writes_a_new_directory(tmp_path: Path) -> None:
     every_type.make(tmp_path / "one.mcap")
     arguments = ["sessions", "export", str(tmp_path / "one.mcap"), "--ros2", str(tmp_path / "bag")]
     assert CliRunner().invoke(cli, arguments).exit_code == 0

@@ -44,7 +44,7 @@ def test_stop_finding_has_car_time_person_cause_once() -> None:
     assert "red at 13:00:00 CET" in stop.describe()
 
 
-def test_the_log_alone_is_enough_and_not_stopped_weighs_more() -> None:
+def test_log_alone_is_enough_and_not_stopped_weighs_more() -> None:
     found = StopFindings()
     found.add(
         "red", "event/log", logged(NOON, "not_stopped", "red may still be moving: red has not reacted to the stop.")
@@ -69,7 +69,7 @@ def test_two_stops_are_two() -> None:
     assert len(found.of("not_stopped")) == 1
 
 
-def test_a_stop_that_ended_as_sent_is_no_finding() -> None:
+def test_stop_that_ended_as_sent_is_no_finding() -> None:
     found = StopFindings()
     found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="sent", basis="sent"))
     found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="complete", basis="shown"))

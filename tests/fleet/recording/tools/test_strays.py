@@ -97,7 +97,7 @@ def test_date_beyond_2262_is_null_with_warning(dated: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "lost"), [("parquet", 2), ("csv", 1)])
-def test_a_date_beyond_2262_breaks_no_other_table(dated: Path, tmp_path: Path, name: str, lost: int) -> None:
+def test_date_beyond_2262_breaks_no_other_table(dated: Path, tmp_path: Path, name: str, lost: int) -> None:
     (out := tmp_path / "out").mkdir()
     done = export(Session(dated).rows(), out, FORMATS[name])
     assert done.undated == {"fleet.v1.CommandEvent": lost}, "CSV has text for the year 9999"
@@ -108,7 +108,7 @@ def test_a_date_beyond_2262_breaks_no_other_table(dated: Path, tmp_path: Path, n
 
 
 @pytest.mark.parametrize("name", ["parquet", "csv"])
-def test_a_clock_beyond_2262_is_null(tmp_path: Path, name: str) -> None:
+def test_clock_beyond_2262_is_null(tmp_path: Path, name: str) -> None:
     made = Mixed(path := tmp_path / "0001.mcap")
     made.own(RANGE)
     (channel,) = made._channels.values()
@@ -132,7 +132,7 @@ def test_no_half_written_file_is_left(tmp_path: Path, dated: Path, name: str) ->
     assert not list(out.iterdir())
 
 
-def test_a_rescue_that_fails_leaves_no_file(tmp_path: Path) -> None:
+def test_rescue_that_fails_leaves_no_file(tmp_path: Path) -> None:
     made = Mixed(path := tmp_path / "0001.mcap")
     made.own(MODE.replace("red", "blue"))
     made.close()

@@ -71,7 +71,7 @@ def test_recovered_session_without_loss_is_whole(tmp_path: Path) -> None:
     assert run("verify", new).exit_code == 0
 
 
-def test_a_file_in_which_nothing_was_recorded_cuts_no_session(tmp_path: Path) -> None:
+def test_file_in_which_nothing_was_recorded_cuts_no_session(tmp_path: Path) -> None:
     path = tmp_path / "s"
     write(path, [[1, 2], [3]])
     Segment(path / "0002.mcap", {}).finish({})
@@ -79,7 +79,7 @@ def test_a_file_in_which_nothing_was_recorded_cuts_no_session(tmp_path: Path) ->
     assert (found.state, found.words, found.length_s) == (SessionState.WHOLE, "", 2.0)
 
 
-def test_a_clock_that_went_back_makes_no_hour(tmp_path: Path) -> None:
+def test_clock_that_went_back_makes_no_hour(tmp_path: Path) -> None:
     times: tuple[list[list[float]], ...] = (
         [[0, 1], [2, 3], [-3596, -3595], [-3594]],
         [[0, 1], [2, 3, -3596.5], [-3595.5], [-3594.5]],

@@ -91,7 +91,7 @@ def test_quota_removal_is_no_damage_and_names_files(thinned: Path) -> None:
     assert words.count("0001.mcap") == words.count("0002.mcap") == 2
 
 
-def test_a_file_that_the_quota_did_not_take_is_damage(thinned: Path) -> None:
+def test_file_that_the_quota_did_not_take_is_damage(thinned: Path) -> None:
     (thinned / "0005.mcap").unlink()
     _, (info,) = sessions("info", thinned)
     assert info["state"] == "damaged"
@@ -101,7 +101,7 @@ def test_a_file_that_the_quota_did_not_take_is_damage(thinned: Path) -> None:
     assert made["origin"]["missing"] == 3 * 60, "no message is counted twice"
 
 
-def test_the_list_of_removed_sessions_is_none_itself(thinned: Path) -> None:
+def test_list_of_removed_sessions_is_none_itself(thinned: Path) -> None:
     root = thinned.parent
     (newest,) = (each for each in root.iterdir() if each != thinned)
     done = enforce(Quota(LIST_BYTES), root, newest)  # half of it is less than the pinned minute
@@ -124,7 +124,7 @@ def recovered(path: Path) -> tuple[Path, dict[str, Any]]:
     return out, description(out)
 
 
-def test_a_recovered_session_says_what_the_quota_had_taken(thinned: Path) -> None:
+def test_recovered_session_says_what_the_quota_had_taken(thinned: Path) -> None:
     out, made = recovered(thinned)
     assert list(Session(out).messages()) == list(Session(thinned).messages())
     assert (made["gone"], made["origin"]["missing"]) == ([], 120)
@@ -142,7 +142,7 @@ def cut(path: Path, start_s: int, end_s: int) -> tuple[Path, dict[str, Any]]:
     return out, description(out)
 
 
-def test_a_cut_says_what_the_quota_had_taken_of_it(thinned: Path) -> None:
+def test_cut_says_what_the_quota_had_taken_of_it(thinned: Path) -> None:
     out, made = cut(thinned, 125, 185)
     assert [int(each.payload[:4]) for each in Session(out).messages()] == [*range(125, 185)]
     assert (made["gone"], made["origin"]["lost"], len(made["pins"])) == ([], "", 1)

@@ -65,7 +65,7 @@ def gaps(verdict: SessionVerdict) -> list[tuple[str, str, int, int, int]]:
     return [(one["key"], one["publisher"], one["first"], one["last"], one["count"]) for one in verdict.missing]
 
 
-def test_a_session_that_lacks_nothing_is_whole(written: Written) -> None:
+def test_session_that_lacks_nothing_is_whole(written: Written) -> None:
     for seq in range(1, 50):
         written.put(RANGE, seq)
         written.raw("fleet/note", b"{}", seq)
@@ -170,7 +170,7 @@ def test_schema_of_another_version_and_invalid_schema_are_told(written: Written)
     assert verdict.whole
 
 
-def test_a_schema_that_makes_no_sense_is_said(written: Written) -> None:
+def test_schema_that_makes_no_sense_is_said(written: Written) -> None:
     written.put(RANGE, 1, schema=b"\xff\xff")
     written.put(RANGE, 2)
     verdict = written.verdict()

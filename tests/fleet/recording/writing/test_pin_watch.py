@@ -42,7 +42,7 @@ def test_condition_pins_before_first_and_after_last_reading() -> None:
     assert pinned == [(0, 30, PinCause.CONDITION, ("red",))], "its clock stepped back; the recorder's counts"
 
 
-def test_a_function_of_a_field_pins() -> None:
+def test_function_of_a_field_pins() -> None:
     of = watch("rate(range_m) < -1")
     assert put(of, "red", "sensor/range", pb.Range(range_m=2.0), 0) == []
     assert len(put(of, "red", "sensor/range", pb.Range(range_m=0.5), 1)) == 1

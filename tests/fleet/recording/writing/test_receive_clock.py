@@ -34,7 +34,7 @@ class SetClock:
         (-S // 10, 11 * S - S // 10),
     ],
 )
-def test_a_step_of_the_wall_clock(step_ns: int, found: int) -> None:
+def test_step_of_the_wall_clock(step_ns: int, found: int) -> None:
     clocks = SetClock()
     assert clocks.wait(10 * S) == BEGAN + 10 * S
     assert clocks.wait(S, step_ns=step_ns) == BEGAN + found

@@ -241,7 +241,7 @@ def test_status_is_published_answered_and_recorded(endpoint: str, bus: Bus, tmp_
     assert [pb.Recording.FromString(m.data).state for m in recorded] == ["recording"] * len(recorded) != []
 
 
-def test_a_second_recorder_is_refused_and_told_of_the_first(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_second_recorder_is_refused_and_told_of_the_first(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with Bus.open(endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()

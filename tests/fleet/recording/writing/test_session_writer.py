@@ -46,7 +46,7 @@ def test_writer_segment_ends_at_size_and_none_is_empty(tmp_path: Path, sync: Syn
     assert tape.bytes == sum(segment.stat().st_size for segment in session.segments)
 
 
-def test_a_file_ends_at_its_time(tmp_path: Path) -> None:
+def test_file_ends_at_its_time(tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
     for second in range(12):
         feed(tape, BEGUN_NS + second * SECOND_NS)
@@ -56,7 +56,7 @@ def test_a_file_ends_at_its_time(tmp_path: Path) -> None:
     assert verify(Session(tape.path)).whole
 
 
-def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
+def test_index_says_what_each_file_has(tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(segment_s=5.0), BEGUN_NS)
     for second in range(12):
         feed(tape, BEGUN_NS + second * SECOND_NS)
@@ -71,7 +71,7 @@ def test_the_index_says_what_each_file_has(tmp_path: Path) -> None:
         assert one["messages"] == one["keys"]["fleet/red/note"]["count"] == len(rows)
 
 
-def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> None:
+def test_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
     for second in (0, 1, 2, -3600, -3599):
         feed(tape, BEGUN_NS + second * SECOND_NS)
@@ -85,7 +85,7 @@ def test_a_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> Non
     assert (one["first_ns"], one["last_ns"]) == (BEGUN_NS - 3600 * SECOND_NS, BEGUN_NS + 2 * SECOND_NS + 9)
 
 
-def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
+def test_session_that_has_enough_says_so(tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(quota=Quota(session=100_000)), BEGUN_NS)
     feed(tape, BEGUN_NS)
     tape.tick(BEGUN_NS)
@@ -97,7 +97,7 @@ def test_a_session_that_has_enough_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("limit", [Quota(session=100_000), Quota(MB)])
-def test_a_session_that_has_enough_begins_no_other_file(limit: Quota, tmp_path: Path) -> None:
+def test_session_that_has_enough_begins_no_other_file(limit: Quota, tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(segment_bytes=100_000, quota=limit), BEGUN_NS)
     feed(tape, BEGUN_NS, count=200)
     tape.tick(BEGUN_NS)

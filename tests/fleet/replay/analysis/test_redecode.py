@@ -35,7 +35,7 @@ def redecoded(items: list[Item], platform: str | None = None) -> tuple[list[Read
 
 
 @pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
-def test_a_recorded_vector_has_no_difference(path: Path) -> None:
+def test_recorded_vector_has_no_difference(path: Path) -> None:
     _, items = vector_file.read(path)
     found, one = redecoded(items)
     assert found == []

@@ -56,7 +56,7 @@ def test_nothing_to_play_is_an_error(fleet: FleetProcesses, tmp_path: Path, key:
     assert len(player.stderr.splitlines()) == 1
 
 
-def test_the_rule_for_keys_is_zenohs() -> None:
+def test_rule_for_keys_is_zenohs() -> None:
     import zenoh
 
     for key in (*BAD_KEYS[:-1], "a/b", "@x/@y", "a b", "\x1b", "\u65e5", "a-*", "/a", "a/", "", "$*", "a$*"):

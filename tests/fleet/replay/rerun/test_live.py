@@ -141,7 +141,7 @@ def test_live_view_counts_strays_and_junk(fleet: FleetProcesses, tmp_path: Path)
     assert rrd_export.rows(out) == {link: 60}
 
 
-def test_a_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) -> None:
+def test_plan_from_before_is_asked_for(fleet: FleetProcesses, tmp_path: Path) -> None:
     from schemas.bus import reply_value
 
     topic = TOPICS["@coordinator/plan"]
@@ -171,7 +171,7 @@ def test_view_counts_messages_dropped_from_full_queue(
     assert following.sent == 10
 
 
-def test_a_page_on_loopback_that_goes_with_the_command(fleet: FleetProcesses) -> None:
+def test_page_on_loopback_that_goes_with_the_command(fleet: FleetProcesses) -> None:
     process = start_view(fleet, "--web")
     publish(fleet.bus, "red", range(5))
     page = process._lines.get(timeout=PATIENCE_S).strip()
@@ -255,7 +255,7 @@ def test_bad_input_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
         assert words in result.stderr.replace("\n", " "), arguments
 
 
-def test_a_viewer_that_cannot_start_is_said() -> None:
+def test_viewer_that_cannot_start_is_said() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         with Viewer("--serve-web", "--port", str(free_port()), "--web-viewer-port", port) as viewer:
@@ -263,7 +263,7 @@ def test_a_viewer_that_cannot_start_is_said() -> None:
             assert viewer.last_error != "it printed nothing"
 
 
-def test_the_guard_ends_its_program_with_its_input() -> None:
+def test_guard_ends_its_program_with_its_input() -> None:
     guard = subprocess.Popen(
         [sys.executable, "-m", "schemas.process.parent_guard", "sleep", "600"],
         stdin=subprocess.PIPE,

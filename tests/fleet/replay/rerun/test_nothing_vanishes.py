@@ -55,7 +55,7 @@ def test_junk_is_named_by_its_cause(tmp_path: Path) -> None:
     }
 
 
-def test_a_level_without_a_name_does_not_end_the_process(tmp_path: Path) -> None:
+def test_level_without_a_name_does_not_end_the_process(tmp_path: Path) -> None:
     made = Mixed(path := tmp_path / "x.mcap")
     made.own(LOG, 2)
     made.put(LOG, "foxglove.Log", UNKNOWN_LEVEL)
@@ -88,7 +88,7 @@ def test_replay_without_fleet_message_is_no_traceback(tmp_path: Path) -> None:
     assert not (tmp_path / "x.rrd").exists()
 
 
-def test_a_part_counts_only_what_is_asked(tmp_path: Path) -> None:
+def test_part_counts_only_what_is_asked(tmp_path: Path) -> None:
     made = Mixed(path := tmp_path / "x.mcap")
     made.own(LINK, 4)
     made.stray(LINK, RANGE)
@@ -127,7 +127,7 @@ def test_recorded_is_shown_and_named_in_files_of_chance(tmp_path: Path, first: i
     check_some(tmp_path, first, 20)
 
 
-def test_a_schema_that_only_rerun_refuses_costs_its_messages_only(tmp_path: Path) -> None:
+def test_schema_that_only_rerun_refuses_costs_its_messages_only(tmp_path: Path) -> None:
     check(tmp_path, 827)  # one bit of the schema of a plan is another
 
 

@@ -109,7 +109,7 @@ def test_drive_right_after_connect_is_not_called_ignored() -> None:
         assert "may not have moved" not in last.words
 
 
-def test_the_repeats_of_a_stop_give_way_at_once() -> None:
+def test_repeats_of_a_stop_give_way_at_once() -> None:
     """A full stop that repeats the end of a drive delays the next drive by the block of its `MODE00` at most."""
     for wait in range(20):
         pair = Pair(start_s=2.0)
@@ -159,7 +159,7 @@ def test_silent_raspberry_pi_is_taken_as_such_until_reading() -> None:
     assert not control.driver.stops.not_stopped
 
 
-def test_a_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
+def test_raspberry_pi_car_that_reports_after_all_has_readings() -> None:
     pair = Pair("raspberry_pi", start_s=2.0)
     feed = pair.decoder.feed
     pair.decoder.feed = lambda *_: []  # type: ignore[method-assign]  # a wire that carries nothing
@@ -253,7 +253,7 @@ def swapped(told: str, mode: Mode) -> Pair:
 
 
 @pytest.mark.parametrize("told", ["auto", "arduino"])
-def test_a_program_that_changes_in_a_silent_mode_is_drivable(told: str) -> None:
+def test_program_that_changes_in_a_silent_mode_is_drivable(told: str) -> None:
     pair = swapped(told, Mode.COLOR_LED)
     pair.until(lambda: pair.control.driver.model.mode.is_over, 15.0)
     answer = pair.ask(Drive(Motion.FORWARD, 1.0), identity="drive")

@@ -109,7 +109,7 @@ def test_platform_is_forgotten_if_link_ends_after_mode_frame() -> None:
         pair.control.driver.link_down("closed", pair.now)
 
 
-def test_a_contradicted_profile_is_told_of_once() -> None:
+def test_contradicted_profile_is_told_of_once() -> None:
     pair = Pair("raspberry_pi", told="arduino", transport=Transport.SERIAL)
     pair.connect()
     pair.run(30.0)

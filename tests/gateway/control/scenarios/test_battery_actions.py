@@ -42,7 +42,7 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
     assert desk.ask(FORWARD).status is Phase.QUEUED
 
 
-def test_a_car_can_be_stopped_by_its_battery() -> None:
+def test_car_can_be_stopped_by_its_battery() -> None:
     desk = Workbench()
     desk.control = control(parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryAction.STOP))
     desk.ready()
@@ -57,7 +57,7 @@ def test_a_car_can_be_stopped_by_its_battery() -> None:
 
 
 @pytest.mark.parametrize("platform", ["raspberry_pi", "raspberry_pi+arm"])
-def test_a_constant_is_no_battery(platform: str) -> None:
+def test_constant_is_no_battery(platform: str) -> None:
     desk = Workbench(platform)
     desk.control.link_up(desk.now)
     for _ in range(20):

@@ -106,7 +106,7 @@ def test_stream_from_before_silence_or_lost_link_drives_no_car() -> None:
 
 
 @pytest.mark.parametrize("platform", ["arduino", "raspberry_pi"])
-def test_a_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
+def test_stop_that_a_stuck_link_keeps_is_not_complete(platform: str) -> None:
     """The answer warns at once, and the stop fails while the car is silent. With a free wire the next stop ends."""
     ends = (Phase.SENT, Basis.SENT) if platform == "raspberry_pi" else (Phase.COMPLETE, Basis.SHOWN)
     pair = Pair(platform, start_s=2.0).ready()
@@ -274,7 +274,7 @@ def test_doubt_without_reason_ends_before_anybody_asks() -> None:
 
 
 @pytest.mark.parametrize("delay_s", [0.02, 0.1, 0.25, 0.4])
-def test_a_slow_link_is_no_deaf_one(delay_s: float) -> None:
+def test_slow_link_is_no_deaf_one(delay_s: float) -> None:
     """Reports that a car sent before it received `MODE00` do not show whether `MODE00` arrived."""
     pair = Pair("arduino", start_s=2.0)
     slow(pair, delay_s)

@@ -103,7 +103,7 @@ def test_silent_mode_of_stm32_stays_assumed(mode: Mode) -> None:
 
 @each_world
 @pytest.mark.parametrize("row", [row for row in TABLE if row["true"] == "manual"], ids=names)
-def test_a_reset_brings_the_car_to_mode_0(row: Row, world: str) -> None:
+def test_reset_brings_the_car_to_mode_0(row: Row, world: str) -> None:
     asked, _ = modes(row)
     pair = car_in(asked, world, seed=TABLE.index(row))
     pair.car.brown_out(pair.now)
@@ -119,7 +119,7 @@ FROM_ASKING = [row for row in TABLE if row["asked_s"] != "-"]
 
 @each_world
 @pytest.mark.parametrize("row", [row for row in FROM_ASKING if row["asked"] != row["true"]], ids=names)
-def test_a_mode_frame_that_is_lost(row: Row, world: str) -> None:
+def test_mode_frame_that_is_lost(row: Row, world: str) -> None:
     """Control requests a mode while the car is in the true one, and the frame does not reach the car."""
     asked, true = modes(row)
     pair = car_in(true, world, seed=TABLE.index(row))
@@ -161,7 +161,7 @@ def told_again(pair: Pair, world: str) -> None:
     ],
     ids=lambda value: names(value) if isinstance(value, dict) else str(value),
 )
-def test_a_mode_that_is_so_is_confirmed(row: Row, before: Mode, world: str) -> None:
+def test_mode_that_is_so_is_confirmed(row: Row, before: Mode, world: str) -> None:
     asked, _ = modes(row)
     pair = car_in(before, world, seed=TABLE.index(row))
     pair.ask(SetMode(asked))
@@ -173,7 +173,7 @@ def test_a_mode_that_is_so_is_confirmed(row: Row, before: Mode, world: str) -> N
 
 
 @each_world
-def test_a_raspberry_pi_car_knows_mode_0_only(world: str) -> None:
+def test_raspberry_pi_car_knows_mode_0_only(world: str) -> None:
     pair = car_in(Mode.MANUAL, world, seed=1, platform="raspberry_pi")
     for mode in Mode:
         pair.car.feed(frame_of(mode), pair.now)

@@ -48,7 +48,7 @@ def test_firmwares_are_told_apart_and_read_in_one_unit() -> None:
     assert one.odometer_m is one.imu_raw is two.attitude_rad is None
 
 
-def test_the_numbers_of_an_arm_are_no_angles() -> None:
+def test_numbers_of_an_arm_are_no_angles() -> None:
     """Another program may say at any time that there is one. Its places have the names of other fields."""
     one, two = read({**GENERAL, "y": -194.1, "torB": -56}), read({**ROS, "ax": 310.2, "torS": 12})
     assert one.attitude_rad is None
@@ -65,12 +65,12 @@ def test_the_numbers_of_an_arm_are_no_angles() -> None:
         ({"T": 1001, "L": 5.1, "R": 0}, Cause.OUT_OF_RANGE),
     ],
 )
-def test_a_damaged_feedback_is_rejected_with_its_cause(fields: dict[str, Any], cause: Cause) -> None:
+def test_damaged_feedback_is_rejected_with_its_cause(fields: dict[str, Any], cause: Cause) -> None:
     assert read(fields).cause is cause
 
 
 @pytest.mark.parametrize("volts", [None, "x", 0, -1, 14, math.inf])
-def test_an_impossible_voltage_is_not_measured(volts: Any) -> None:
+def test_impossible_voltage_is_not_measured(volts: Any) -> None:
     assert read(GENERAL | {"v": volts}).voltage_v is None
 
 

@@ -17,7 +17,7 @@ def heard(played: CaptureCar, until: float) -> list[tuple[float, bytes]]:
 
 
 @pytest.mark.parametrize("rate", [0.5, 1.0, 4.0])
-def test_the_times_of_the_file_are_kept(rate: float) -> None:
+def test_times_of_the_file_are_kept(rate: float) -> None:
     played = CaptureCar(PIECES, rate=rate, now=10.0)
     assert heard(played, inf if rate < 0 else 1000.0) == [(10.0 + at / rate, data) for at, data in PIECES]
     assert played.done
@@ -32,7 +32,7 @@ def test_one_late_look_gives_all_that_was_due() -> None:
 
 
 @pytest.mark.parametrize("pieces", [PIECES, [(0.0, b"x")]])
-def test_a_loop_begins_again_after_a_pause(pieces: list[tuple[float, bytes]]) -> None:
+def test_loop_begins_again_after_a_pause(pieces: list[tuple[float, bytes]]) -> None:
     played = CaptureCar(pieces, rate=2.0, loop=True, now=0.0)
     times = [at for at, _ in heard(played, 20.0)]
     length = (pieces[-1][0] + LOOP_PAUSE_S) / 2

@@ -56,7 +56,7 @@ async def test_other_modes_do_not_see_it(mode: int) -> None:
     assert pressed.received == unpressed.received
 
 
-async def test_a_raspberry_pi_does_not_see_it() -> None:
+async def test_raspberry_pi_does_not_see_it() -> None:
     car = virtual("raspberry_pi")
     assert not car.car.press(Button.FORWARD, car.now)
     await car.wait(3.0)
@@ -76,7 +76,7 @@ async def test_first_press_during_mode_opening_is_obeyed_later() -> None:
     assert 0.2 + opening_s(1) <= car.now <= 0.2 + opening_s(1) + 0.1
 
 
-async def test_a_press_that_a_close_overtakes_is_forgotten() -> None:
+async def test_press_that_a_close_overtakes_is_forgotten() -> None:
     car = await in_mode(1)
     assert car.car.press(Button.WHISTLE, car.now)  # busy for 0.3 s
     assert car.car.press(Button.FORWARD, car.now)
@@ -101,7 +101,7 @@ async def test_speed_and_whistle() -> None:
     assert not car.truth.blocked
 
 
-async def test_a_reset_forgets_a_press() -> None:
+async def test_reset_forgets_a_press() -> None:
     car = await in_mode(1)
     car.car.press(Button.WHISTLE, car.now)
     car.car.press(Button.FORWARD, car.now)

@@ -79,7 +79,7 @@ async def test_following_a_car(where: str, at: tuple[float, float], word: bytes,
     ],
     ids=["disc", "box"],
 )
-async def test_a_thing_is_followed_as_a_car_is(thing: MovingObject) -> None:
+async def test_thing_is_followed_as_a_car_is(thing: MovingObject) -> None:
     car = await opened(lit(Lamp(9.0, 9.0), thing=thing), 6)
     assert b"HW00" in car.received
     assert (car.truth.motor_left, car.truth.motor_right) == (200, 200)
@@ -172,7 +172,7 @@ def test_cars_that_do_not_meet_are_as_if_alone() -> None:
     assert green.pose(2) == Pose(0.3, 0.0, 0.0)
 
 
-def test_a_car_neither_drives_through_another_nor_pushes_it() -> None:
+def test_car_neither_drives_through_another_nor_pushes_it() -> None:
     world = before(1.0, 0.01)
     red, green = (CarBody(world, world.start_pose(0, name), random.Random(1), name=name) for name in ("red", "green"))
     red.drive(0, 255, 255)
@@ -315,7 +315,7 @@ async def test_lost_follower_finds_leader_put_before_it() -> None:
     await car.until(lambda truth: not truth.driving)
 
 
-async def test_a_lamp_is_switched_while_a_car_seeks_it() -> None:
+async def test_lamp_is_switched_while_a_car_seeks_it() -> None:
     world = lit(Lamp(5.0, 0.0, reach_m=9.0, name="beacon"))
     car = await opened(world, 5)
     assert car.truth.driving
@@ -325,7 +325,7 @@ async def test_a_lamp_is_switched_while_a_car_seeks_it() -> None:
     await car.until(lambda truth: truth.driving)
 
 
-async def test_a_general_frame_drives_in_a_lively_world_too() -> None:
+async def test_general_frame_drives_in_a_lively_world_too() -> None:
     car = VirtualStranger(cars(before(3.0, 0.0), "red", "green")["red"])
     await car.write(RUN)
     await car.wait(2.0)

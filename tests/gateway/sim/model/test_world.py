@@ -18,7 +18,7 @@ def body(world: World, x: float = 0.0, y: float = 0.0, degrees: float = 0.0) -> 
 
 
 @pytest.mark.parametrize("index", range(6))
-async def test_a_tracking_car_follows_the_line_for_a_minute(index: int) -> None:
+async def test_tracking_car_follows_the_line_for_a_minute(index: int) -> None:
     world = World.room()
     car = virtual(world=world)
     car.car._body = CarBody(world, world.start_pose(index), random.Random(1))
@@ -43,7 +43,7 @@ async def test_a_tracking_car_follows_the_line_for_a_minute(index: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-async def test_an_avoiding_car_turns_away_from_walls(seed: int) -> None:
+async def test_avoiding_car_turns_away_from_walls(seed: int) -> None:
     world = World.room()
     car = virtual(world=world)
     car.car._body = CarBody(world, world.start_pose(seed), random.Random(seed))
@@ -94,7 +94,7 @@ def test_dead_reckoning_is_exact_whatever_the_steps() -> None:
             assert pose == pytest.approx((x, y, heading), abs=1e-9)
 
 
-def test_a_wall_holds_a_car() -> None:
+def test_wall_holds_a_car() -> None:
     car = body(World([(0.5, -1.0, 0.5, 1.0)]))
     car.drive(0, 255, 255)
     assert car.pose(10).x_m == pytest.approx(0.5 - RADIUS_M)
@@ -113,7 +113,7 @@ def test_sensors_tell_left_from_right() -> None:
     assert body(line).range_cm(0, 0) is None
 
 
-def test_the_tape_is_brighter_or_darker_than_the_floor() -> None:
+def test_tape_is_brighter_or_darker_than_the_floor() -> None:
     world = World.room()
     pose = world.start_pose(0)
     assert body(world, pose.x_m, pose.y_m).grayscale(0) != body(world, 0.0, 0.6).grayscale(0)

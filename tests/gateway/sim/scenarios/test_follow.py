@@ -107,7 +107,7 @@ def test_row_stands_without_light_of_leader() -> None:
     assert all(hypot(a[0] - b[0], a[1] - b[1]) > 0.1 for a, b in zip(row.places(), stood, strict=True))
 
 
-def test_a_leader_that_a_person_stops_stops_the_row() -> None:
+def test_leader_that_a_person_stops_stops_the_row() -> None:
     row = Row(spec().world())
     row.go()
     row.run(3.0)
@@ -131,7 +131,7 @@ def test_nobody_follows_cars_that_do_not_meet() -> None:
     assert row.places()[0] != began[0]
 
 
-def test_a_lamp_on_a_cars_back_leads_the_next() -> None:
+def test_lamp_on_a_cars_back_leads_the_next() -> None:
     follow = spec()
     lamps = (*follow.lamps, Lamp(-0.13, 0.0, reach_m=3.0, name="tail", carried_by="red"))
     row = Row(World(follow.walls, (), lamps, things=follow.things, starts=follow.starts, cars_meet=True))
@@ -144,7 +144,7 @@ def test_a_lamp_on_a_cars_back_leads_the_next() -> None:
     assert row.places()[1][0] > 1.0
 
 
-def test_a_follower_follows_a_thing_on_a_path() -> None:
+def test_follower_follows_a_thing_on_a_path() -> None:
     post = MovingObject("post", radius_m=0.1, path=((0.35, 0.0), (3.0, 0.0)), speed_m_s=0.1, waits_for_m=0.37)
     starts = {name: pose._replace(y_m=2.0) for name, pose in spec().starts.items()}
     starts["green"] = starts["green"]._replace(x_m=0.0, y_m=0.0)

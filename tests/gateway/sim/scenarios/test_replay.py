@@ -166,7 +166,7 @@ def test_sim_replay_errors_are_one_line(kept: Path, tmp_path: Path, capsys: pyte
         assert said.startswith("gateway sim: ")
 
 
-def test_a_capture_of_a_car_plays_as_that_car(start: Any, tmp_path: Path) -> None:
+def test_capture_of_a_car_plays_as_that_car(start: Any, tmp_path: Path) -> None:
     """A host's capture of a simulated car plays again, byte for byte."""
     sim = start("--car", "red:arduino:tcp", "--fault", "red:garbage@0.2+50")
     with connect(sim.line()["link"]) as connection:

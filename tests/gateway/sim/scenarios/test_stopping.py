@@ -179,13 +179,13 @@ async def stops_begun_at_random_moments(case: Case, count: int) -> None:
 
 
 @pytest.mark.parametrize("case", CASES, ids=str)
-async def test_a_stop_begun_at_a_random_moment(case: Case) -> None:
+async def test_stop_begun_at_a_random_moment(case: Case) -> None:
     await stops_begun_at_random_moments(case, MOMENTS)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("case", CASES, ids=str)
-async def test_a_stop_begun_at_many_random_moments(case: Case) -> None:
+async def test_stop_begun_at_many_random_moments(case: Case) -> None:
     await stops_begun_at_random_moments(case, 4 * MOMENTS)
 
 

@@ -3,7 +3,7 @@
 from gateway.drivers.yahboom.estimate.learned import MAX_LEARNED_S, Learned
 
 
-def test_a_gap_is_no_rhythm() -> None:
+def test_gap_is_no_rhythm() -> None:
     learned = Learned()
     assert not learned.add_interval(MAX_LEARNED_S + 0.1, echo=True)
     assert not learned.echo.is_known

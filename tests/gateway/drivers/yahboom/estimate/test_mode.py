@@ -98,7 +98,7 @@ def test_two_of_another_mode_are_forgotten_when_its_own_comes() -> None:
     assert truth.verdict is CONFIRMED
 
 
-def test_a_damaged_reading_of_another_mode_does_not_confirm() -> None:
+def test_damaged_reading_of_another_mode_does_not_confirm() -> None:
     """A tracking frame with one wrong digit has the shape of mode 0, because there is no checksum."""
     truth = asked(Mode.MANUAL)
     damaged = reading(b"$4WD,CSB0,PV8,GS0,LF1001,HW01,GM00#", 5.0)
@@ -275,13 +275,13 @@ def test_silence_of_car_without_silent_modes_is_no_mode(platform: str, fits: tup
     assert ("program has ended" in truth.evidence) is (not fits)
 
 
-def test_the_fan_of_a_raspberry_pi_car_silences_nothing() -> None:
+def test_fan_of_a_raspberry_pi_car_silences_nothing() -> None:
     truth = estimator("raspberry_pi")
     truth.on_mode_sent(Mode.MANUAL, now=0.0, block_s=0.0)
     assert truth.silence_limit(fan=True) == 3.0
 
 
-def test_a_lost_link_forgets() -> None:
+def test_lost_link_forgets() -> None:
     truth = asked(Mode.TRACKING)
     truth.on_reading(reading(SHAPES[Mode.TRACKING], 4.0))
     truth.forget()

@@ -131,7 +131,7 @@ def test_damaged_frames_do_not_change_head(*, auto: bool) -> None:
     assert truth.profile.dialect.head == "4WD"
 
 
-def test_the_bytes_know_the_head_better_than_an_option() -> None:
+def test_bytes_know_the_head_better_than_an_option() -> None:
     truth = PlatformDetector(parse_platform("unknown+head=CART"), auto=True)
     hear_raw(truth, *["BALA"] * EVIDENCE_FRAMES)
     assert truth.profile.name == "unknown+head=BALA"
@@ -146,7 +146,7 @@ def test_unexpected_head_is_taken_and_told_once() -> None:
     assert not truth.doubted, "everything else is as it was named"
 
 
-def test_a_car_that_is_neither_is_treated_as_unknown() -> None:
+def test_car_that_is_neither_is_treated_as_unknown() -> None:
     truth = PlatformDetector(parse_platform("unknown"), auto=True)
     hear(truth, *[ARDUINO] * EVIDENCE_FRAMES)
     assert truth.profile.name == "arduino"

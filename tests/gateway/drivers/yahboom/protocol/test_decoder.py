@@ -193,7 +193,7 @@ class TestOverlong:
         assert cut.cause is Cause.TRUNCATED
         assert isinstance(good, Sensors)
 
-    def test_a_frame_that_never_ends_is_held_in_bounds(self) -> None:
+    def test_frame_that_never_ends_is_held_in_bounds(self) -> None:
         decoder = Decoder()
         events = [event for _ in range(5000) for event in decoder.feed(b"$4WD,CSB" + b"1" * 20 + b"." * 200, 1.0)]
         assert len(decoder._buffer) <= 256
@@ -204,7 +204,7 @@ class TestOverlong:
         assert isinstance(decoder.feed(GOOD, 1.0)[-1], Sensors)
 
     @pytest.mark.parametrize("most", [0, 63, 257, 10_000])
-    def test_the_limit_is_itself_limited(self, most: int) -> None:
+    def test_limit_is_itself_limited(self, most: int) -> None:
         with pytest.raises(ValueError, match=r"max_frame: \d+, allowed are 64\.\.256"):
             Decoder(most)
 
@@ -224,13 +224,13 @@ class TestEcho:
         events = [event for byte in self.SENT * 2 for event in decoder.feed(bytes([byte]), 1.5)]
         assert events == [Echo(self.SENT, 1.5)] * 2
 
-    def test_a_sensors_frame_that_we_sent_is_an_echo_too(self) -> None:
+    def test_sensors_frame_that_we_sent_is_an_echo_too(self) -> None:
         decoder = Decoder()
         decoder.sent(GOOD, 1.0)
         assert decoder.feed(GOOD, 1.1) == [Echo(GOOD, 1.1)]
         assert isinstance(decoder.feed(GOOD, 3.1)[0], Sensors)
 
-    def test_a_lone_end(self) -> None:
+    def test_lone_end(self) -> None:
         decoder = Decoder()
         decoder.sent(b"#", 1.0)
         decoder.sent(b"$4WD,MODE00#", 1.05)

@@ -57,14 +57,14 @@ def events_of(bursts: list[tuple[bytes, float]], size: int | None, *, ticks: boo
 
 
 @given(BURSTS)
-def test_the_same_events_however_the_bytes_are_cut(bursts: list[tuple[bytes, float]]) -> None:
+def test_same_events_however_the_bytes_are_cut(bursts: list[tuple[bytes, float]]) -> None:
     whole = events_of(bursts, None, ticks=False)
     for size, ticks in ((1, False), (2, False), (20, False), (None, True), (1, True), (20, True)):
         assert events_of(bursts, size, ticks=ticks) == whole
 
 
 @given(STREAM, st.lists(st.integers(0, 2000), max_size=8))
-def test_the_same_events_for_arbitrary_cuts(stream: bytes, cuts: list[int]) -> None:
+def test_same_events_for_arbitrary_cuts(stream: bytes, cuts: list[int]) -> None:
     whole = Decoder()
     cut = Decoder()
     edges = sorted({0, len(stream), *(edge for edge in cuts if edge < len(stream))})
@@ -86,7 +86,7 @@ def test_no_byte_is_lost_or_seen_twice(stream: bytes) -> None:
 
 
 @given(st.binary(max_size=3000).filter(lambda garbage: b"$" not in garbage[-300:]))
-def test_a_good_frame_after_any_garbage_decodes(garbage: bytes) -> None:
+def test_good_frame_after_any_garbage_decodes(garbage: bytes) -> None:
     good = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
     event = Decoder().feed(garbage + good, 1.0)[-1]
     assert isinstance(event, Sensors)

@@ -12,7 +12,7 @@ def test_auto_is_the_unknown_platform_until_then(told: str, name: str) -> None:
     assert (started, parse_platform(started).name, auto) == (name, name, told.startswith("auto"))
 
 
-def test_a_platform_that_is_none_says_which_there_are() -> None:
+def test_platform_that_is_none_says_which_there_are() -> None:
     with pytest.raises(ValueError, match=r'Unknown platform "uno"\.'):
         parse_option("uno")
 
@@ -23,12 +23,12 @@ def test_platform_options_ignore_case_except_head() -> None:
 
 
 @pytest.mark.parametrize("name", ["arduino+head=A", "arduino+head=", "arduino+head=ABCDEFGHI", "arduino+head=4,D"])
-def test_a_head_is_2_to_8_letters_and_digits(name: str) -> None:
+def test_head_is_2_to_8_letters_and_digits(name: str) -> None:
     with pytest.raises(ValueError, match="2 to 8 letters and digits"):
         parse_name(name)
 
 
-def test_a_car_has_one_head() -> None:
+def test_car_has_one_head() -> None:
     with pytest.raises(ValueError, match="one head"):
         parse_name("arduino+head=AB+head=CD")
 
