@@ -168,7 +168,7 @@ def claims_of(
 
 def describe_end_of_doubt(car: str) -> str:
     """Return a text that says how to end the doubt about a car. No plan uses the car until then."""
-    return f"`fleet stop {car}` ends the doubt if the car then shows its stop, `fleet resume {car}` if a person has "
-
-
-"looked at the car."
+    return (
+        f"`fleet stop {car}` ends the doubt if the car then shows its stop, `fleet resume {car}` if a person has "
+        "looked at the car."
+    )
