@@ -102,7 +102,10 @@ class Fleet:
         return await self.call(self.sync.get, expression)
 
     async def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
-        """Return the last `last` values of every matching key, or those of the last `since_s` seconds, or both."""
+        """Return the newest `last` values of every matching key, or those of the last `since_s` seconds.
+
+        With both, return the newest `last` values of that time.
+        """
         return await self.call(self.sync.history, expression, last=last, since_s=since_s)
 
     def watch(self, expression: str, *, when: str | None = None) -> "Watch":
@@ -118,7 +121,7 @@ class Fleet:
         return watch
 
     async def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until `when` holds of a fresh reading and return that reading. Raises wait.NotInTime."""
+        """Wait until the condition `when` is true for a fresh reading, and return it. Raises wait.NotInTime."""
         key_expression = self.sync.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)
         try:
@@ -172,7 +175,7 @@ class Fleet:
         return await self.ask(plain_request(Verb.UNPAUSE))
 
     async def lend(self, cars: Iterable[str], to: str, duration_s: float) -> list[Outcome]:
-        """Lend these cars to a person: until then only that person and leads drive them."""
+        """Lend these cars to a person. For `duration_s`, only that person and leads can drive them."""
         return await self.ask(lend_request(to, duration_s), cars)
 
     async def end_loan(self, cars: Iterable[str]) -> list[Outcome]:

@@ -51,7 +51,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
     return {
         car: CarEvidence(
-            # Its times are by its gateway's clock.
+            # The stamps are by the gateway's clock, so the ages must be, too.
             CarState.of_answers(car, answers.get(car, []), now + clocks.get(car, 0.0), present=car in present),
             now + clocks.get(car, 0.0),
             clock_off_s=clocks.get(car),

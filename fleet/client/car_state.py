@@ -3,11 +3,11 @@
 Pure: time is an argument (s, of any one clock). Lists, status, doctor, console and the plan all look at a car through
 one `CarState`, so that they agree. `claims` puts it into words.
 
-**How old is a message?** It could count from when the message came, by our clock, or from its stamp, by the gateway's
-clock. The clocks of two computers differ by seconds. By its stamps, a car that publishes once a second could then look
-stale. So the age of a message that was published just now counts from when it came. An answer to a query is different.
-It may have waited in a gateway that hangs, or come from a replay, and only its stamp shows its age (`age_of_answer_s`).
-A stamp far ahead of our clock is from before a clock was set back. Such a message counts as stale.
+**How old is a message?** Its age could count from its arrival, by our clock, or from its stamp, by the gateway's clock.
+The clocks of two computers differ by seconds. By its stamps, a car that publishes once a second could then look stale.
+So the age of a message that was published just now counts from its arrival. An answer to a query is different. It may
+have waited in a gateway that hangs, or come from a replay, and only its stamp shows its age (`age_of_answer_s`). If a
+stamp is far ahead of our clock, a clock was set back since then. Such a message counts as stale.
 
 **Does its gateway still run?** The states of a gateway that has ended no longer count. They are kept as its last words,
 since a person wants to know them, but `of` does not return them. They are forgotten as soon as another gateway of the
@@ -35,9 +35,9 @@ from schemas.words import CarTrust, LinkState, Motors, Rank
 NO_ANSWER: Final = "its gateway does not answer"
 NEVER_HEARD: Final = "nothing was heard from it yet"
 _MAX_KNOWN_ENDED: Final = 8
-"""Number of ended gateways of a car whose late messages are recognized."""
+"""Number of ended gateways that are remembered for each car, to recognize their late messages."""
 LATE_MESSAGE_NS: Final = 2_000_000_000
-"""A message of an ended gateway does not count, unless its stamp is newer than all others by more than this, ns."""
+"""A message of an ended gateway counts only if its stamp is newer than all others by more than this time."""
 _UNHEARD_S: Final = 3.0
 """Silence after which a car counts as unheard if the state of its motors is unknown."""
 
@@ -47,7 +47,7 @@ class GatewayStarts:
 
     Each start of a gateway has a `boot_id`. A message of an earlier start may come late, through a cache or a slow
     reader. It must not bring back what that gateway claimed. Two gateways of a car may run for a moment, until one of
-    them ends. So a message that is stamped clearly later than all others counts, whatever its start.
+    them ends. So a message that is stamped clearly later than all others counts, whichever start it is from.
     """
 
     def __init__(self) -> None:
@@ -139,7 +139,7 @@ class CarState:
             self._starts.end()
 
     def on_sleep(self, slept_s: float) -> None:
-        """Make all messages older by a sleep of the computer: the clock of their times stood still meanwhile."""
+        """Add a sleep of the computer to the age of all messages, because our clock stood still during the sleep."""
         for topic, seen in self.newest_by_topic.items():
             self.newest_by_topic[topic] = seen.aged(slept_s)
 
@@ -209,7 +209,7 @@ class CarState:
     def driver(self) -> str:
         """The client that drives the car: the owner of its motion, or the holder of its lease.
 
-        Empty for none, or a plan.
+        Empty if nobody drives the car, or a plan does.
         """
         lease = self.safety.lease
         return self.motion.owner or ("" if lease.kind == Rank.COORDINATOR else lease.holder)
@@ -228,7 +228,10 @@ class CarState:
 
     @property
     def is_unheard(self) -> bool:
-        """True if the link is open and the car is silent: stale, without any byte, or unknown for too long."""
+        """True if the link is open, but the car was not heard.
+
+        So the link is stale, or no byte has come, or the car is silent and the state of its motors is unknown.
+        """
         if self.of("state/link") is None or self.link.state == LinkState.LOST:
             return False
         if self.link.state == LinkState.STALE or self.last_rx_s is None:
@@ -255,7 +258,7 @@ class CarState:
         return None if heard else NEVER_HEARD
 
     def why_missing(self, now: float) -> str:
-        """Return why a car is missing from a start, in words, or an empty text if it is ready."""
+        """Return why the start of a fleet still waits for this car, in words. Empty if the car is ready."""
         why = self.why_not_ready(now)
         if why is None or why:
             return why or ""

@@ -62,7 +62,8 @@ _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
 """Poll interval of a wait without a timeout."""
 _MAX_STOP_THREADS: Final = 1024
-"""Maximum number of queries of stops that wait at the same time, each on a thread. A stop of all cars has two."""
+"""Maximum number of threads for the queries of stops. Each query waits on its own thread. A stop of all cars makes two
+queries."""
 _MIN_QUERY_TIMEOUT_S: Final = 0.1
 """Minimum timeout of the query for the current values, even if the wait itself is shorter."""
 
@@ -86,7 +87,8 @@ def default_sender(person: str | None = None) -> str:
 def certified_sender(identity: str, sender: str | None = None, person: str | None = None) -> str:
     """Return the full name under which a client sends commands: `sender`, or else the default one.
 
-    `identity` is the owner of the client's certificate. If it is a person, raises keys.BadKey for another person.
+    `identity` is the owner of the client's certificate. If the owner is a person, only this person may be the sender:
+    raises keys.BadKey for another one.
     """
     known = parse_identity(identity)
     if known is None or known[0] is not IdentityRole.PERSON:
@@ -212,9 +214,10 @@ class Fleet:
     def history(self, expression: str, *, last: int | None = None, since_s: float | None = None) -> list[Reading]:
         """Return the newest `last` values of every matching key, or those of the last `since_s` seconds.
 
-        With both, return the newest `last` values of that time. They are sorted by key and time. A gateway stores 1500
-        values of each sensor, and only the latest value of each state. `fleet.client.history_query.describe_shortfalls`
-        says what is missing. Raises ValueError.
+        With both, return the newest `last` values of that time. The result is sorted by key and time. A gateway stores
+        1500 values of each sensor, and only the latest value of each state.
+        `fleet.client.history_query.describe_shortfalls` says what is missing. Raises ValueError for values out of
+        range.
         """
         selector = history_query.selector(self.expression(expression), last=last, since_s=since_s)
         found: list[Reading] = []
@@ -242,11 +245,11 @@ class Fleet:
         return sorted(found, key=lambda reading: reading.key)
 
     def watch(self, expression: str, *, when: str | None = None) -> Watch:
-        """Subscribe to readings: `for reading in fleet.watch("*/sensor/range")`.
+        """Return a stream of the readings to come: `for reading in fleet.watch("*/sensor/range")`.
 
-        With `when`, a condition on the fields of one message such as `range_m < 0.3`, it yields only messages for which
-        the condition is true. It receives readings until the fleet is closed. To end it earlier, use it with `with`.
-        Raises conditions.BadExpression.
+        `when` is a condition on the fields of one message, such as `range_m < 0.3`. The stream then yields only
+        messages for which the condition is true. It ends when the fleet is closed, or earlier at the end of a `with`
+        block. Raises conditions.BadExpression.
         """
         key_expression = check_key(self.expression(expression))
         accept = None if when is None else KeyCondition.of(when, key_expression).holds
@@ -260,9 +263,9 @@ class Fleet:
         return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until the condition `when` is true for a reading, and return that reading. The current one counts, too.
+        """Wait until the condition `when` is true for a reading, and return it. The current reading counts, too.
 
-        With `for_s`, the condition must have been true for this time in all readings, by their stamps. Without
+        With `for_s`, the condition must have been true in all readings of this time, by their stamps. Without
         `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
         """
         key_expression = self.expression(expression)

@@ -46,7 +46,10 @@ class PresenceChange:
 
 
 class SupervisedCars:
-    """The cars whose gateways a supervisor runs (none without one), and the cars that were then on the bus."""
+    """The cars whose gateways a supervisor runs, and the cars that were on the bus when it answered.
+
+    Without a supervisor, there are no such gateways.
+    """
 
     def __init__(self, names: frozenset[str], present: frozenset[str]) -> None:
         self.names = names
@@ -88,14 +91,14 @@ class PendingCommand:
         self._hubs = hubs
         self._hubs_then = hubs()
         self.is_taken: Future[bool] = Future()
-        """True as soon as a gateway has answered, or no gateway is there. False if no gateway has answered, and the bus
-        was lost or the Fleet closed."""
+        """True as soon as a gateway has answered, or nobody is waited for any more. False if the bus was lost or the
+        Fleet was closed before a gateway answered."""
         self.lost_bus = False
         """True if the bus was lost before the stop was answered."""
         self._bus_back_at: float | None = None
         """The time at which the bus came back. None while it is lost, or if it never was."""
         self._unanswered_at: dict[str, float] = {}
-        """By car: when the last query of a stop to it ended without an answer."""
+        """The time at which the last query of a stop ended without an answer, by car."""
         self.inbox: queue.Queue[Item] = queue.Queue(_MAX_QUEUED_ITEMS)
         self._asked_at = time.monotonic()
         self._is_closed = False
@@ -234,8 +237,8 @@ class PendingCommand:
             self._on_supervised(item, at)
         elif self._named is None or self.concerns(item.car):
             self._note_taken(taken=True)
-            # If a resume ends an e-stop of the whole fleet, gateways tell each other under the same id. So this event
-            # may be of a car to which the command was not sent.
+            # If a resume ends an e-stop of the whole fleet, gateways tell each other, with the id of this command. So
+            # this event may be of a car to which the command was not sent.
             self._of(item.car).on_event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
 
     def _on_presence(self, change: PresenceChange, at: float) -> None:

@@ -147,7 +147,10 @@ def estop_request(why: str, scope: str) -> CommandRequest:
 
 
 def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
-    """Request the end of the e-stops with these ids. Without ids: of the hold. With `everything`: of both."""
+    """Request the end of the e-stops with these ids. Without ids, request the end of the hold.
+
+    With `everything`, request the end of the hold and of all e-stops.
+    """
     return CommandRequest(Verb.RESUME, pb.ResumeCommand(ids=ids, all=everything))
 
 
@@ -227,7 +230,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(speed_request(step))
 
     def fan(self, state: str | None = None) -> R:
-        """Toggle the fan, or turn it `on` or `off`. These two work only while the gateway knows its state."""
+        """Toggle the fan, or turn it `on` or `off`. On and off work only while the gateway knows the fan's state."""
         return self.do(fan_request(state))
 
     def stop(self) -> R:

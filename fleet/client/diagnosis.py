@@ -45,7 +45,7 @@ _SILENT: Final = "silent"
 _PORT_SHARED: Final = "port_shared"
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
 _NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
-"""Counts in `rejects` of a link that are not rejected frames."""
+"""The names in a link's `rejects` that do not count rejected frames."""
 FAILED_PHASES: Final = (Phase.REJECTED, Phase.FAILED, Phase.EXPIRED)
 """Phases of a command that was not carried out."""
 _CARRIED_OUT: Final = (Phase.SENT, Phase.EFFECT_SEEN, Phase.COMPLETE)
@@ -71,9 +71,9 @@ class CarEvidence:
     coordinated: bool = False
     """True if a coordinator is on the bus."""
     clock_off_s: float | None = None
-    """How far the clock of its gateway's computer is ahead of ours, negative if behind, or None if not known."""
+    """How far the clock of the gateway's computer is ahead of ours. Negative if it is behind, None if not known."""
     runs_here: bool = False
-    """True if a gateway of the car runs on this computer, on the bus or not."""
+    """True if a gateway of the car runs on this computer, even if it is not on the bus."""
     asked: bool = False
     """True if the states are answers to a query. So something answers for the car, even if the states are old, as in a
     replay."""
@@ -411,7 +411,7 @@ def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
 
 
 def doubtful(evidence: CarEvidence) -> set[str]:
-    """Return the names of the facts of `describe` that may be wrong, because the car has not shown them."""
+    """Return the names of those facts that may be wrong, because the car has not shown them. Names as in `describe`."""
     state = evidence.state
     if not state.present:
         return set(state.claims(evidence.now).by_name)

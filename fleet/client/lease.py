@@ -1,5 +1,6 @@
-"""The lease of a car, `with fleet.car("red").lease() as car`. The block's end stops the car, if the lease is not lost.
+"""The lease of a car, `with fleet.car("red").lease() as car`. The end of the block stops the car.
 
+A car whose lease was lost is not stopped, because it has another holder.
 `Lease` acquires, renews and releases it. `LeaseMonitor` detects its loss from the gateway's messages (pure).
 """
 
@@ -79,7 +80,7 @@ class LeaseMonitor:
 
 
 def _other(sender: str, ours: str) -> str:
-    """Return the name of another sender, even if it is the same person's."""
+    """Return the name of another sender. Another program of our own person is named as such."""
     name = keys.name_of(sender)
     return f"another program of {name}" if name == keys.name_of(ours) else name
 

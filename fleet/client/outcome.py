@@ -48,7 +48,7 @@ class Outcome:
 
     car: str
     ok: bool
-    """True if the command was carried out: it was sent to the car, or completed if it lasts."""
+    """True if the command was carried out: it was sent to the car, and if it takes time, it is complete."""
     phase: str
     """The last phase (`sent, complete, superseded, expired, failed, rejected, queued`), or `no_answer`."""
     reason: str = ""
@@ -138,7 +138,7 @@ class Progress:
         self._unanswered = ""
         """Why the last query of a stop ended without an answer."""
         self._bus_lost_until: float | None = None
-        """The time to give up on a stop without an answer after the bus was lost."""
+        """The time to give up, for a stop that had no answer when the bus was lost."""
 
     @property
     def is_awaited(self) -> bool:

@@ -29,8 +29,8 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 def age_of_answer_s(stamp_s: float, now: float) -> float:
     """Return the age of an answer to a query, by its stamp. Both times: s since the epoch.
 
-    At least 0, as clocks differ. Infinite if the stamp is far ahead: then a wall clock was set back after it, and the
-    value may be of any age.
+    At least 0, as clocks differ. Infinite if the stamp is far ahead: then a wall clock was set back since the stamp,
+    and the value may be of any age.
     """
     return inf if stamp_s - now > MAX_STAMP_AHEAD_S else max(0.0, now - stamp_s)
 
@@ -52,7 +52,7 @@ class Reading:
 
     @classmethod
     def of(cls, key: str, value: Any, time_ns: int) -> Self:
-        """Return the reading of a message. `time_ns` is its time if it has no stamp, ns since the epoch."""
+        """Return the reading of a message. If the message has no stamp, its time is `time_ns` (ns since the epoch)."""
         stamp = getattr(value, "stamp", None) or getattr(value, "timestamp", None)
         if stamp is not None and stamp.seconds:
             time_ns = messages.stamp_ns(stamp)
