@@ -1,6 +1,6 @@
 """The coordinator: a client of the bus with a policy. Samples come in, commands and publications go out.
 
-policy/ makes all decisions. It also decides to leave a car on hold alone, and the gateway enforces the hold, too.
+policy/ makes all decisions. One of them is to send nothing to a car on hold. The gateway enforces the hold, too.
 """
 
 import time
@@ -36,7 +36,8 @@ from schemas.words import Level, Phase
 
 STEP_INTERVAL_S: Final = 0.1
 SINGLETON_RECHECK_S: Final = 1.0
-"""Delay of the second search for other coordinators, because two may have started at the same moment."""
+"""Delay of the second search for other coordinators. Two that start at the same moment do not find each other at first.
+"""
 _MAX_STATE_QUERIES: Final = 3
 """Maximum number of queries for the cars' states at the start. A stalled gateway may miss the first one."""
 _PLAN_SET: Final = "plan_set"
@@ -58,7 +59,7 @@ class Coordinator:
     on_failure: Callable[[str], None]
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)
     people: People | None = None
-    """The people in the fleet file, who may change the plan. If it is None, the people of the gateways may."""
+    """The people in the fleet file, who may change the plan. If None, the people whom the gateways know may."""
     run_name: str = ""
     """Name of its `fleet up` run. In a new run, the plan starts from the beginning."""
     sleep: SleepWatch = field(default_factory=lambda: SleepWatch(clock_pair()))

@@ -40,15 +40,15 @@ Item = Sample | QueriedSample | zenoh.Query
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """One portion of the inbox of a program that only listens: messages, and gateways that came or left."""
+    """What a program that only listens takes from its inbox at once: messages, and gateways that came or left."""
 
     now: float
     """The time at which they were taken from the inbox, s, monotonic."""
     gateways: Mapping[str, bool]
     """The cars whose gateways arrived (True) or left."""
     samples: Sequence[tuple[Sample, float | None]]
-    """Messages, each with the wall clock (s) if a query returned it, as it may be old, or None if it was just
-    published."""
+    """Messages. An answer to a query may be old, so it comes with the wall clock (s). A message that was just published
+    comes with None."""
 
 
 class Inbox:

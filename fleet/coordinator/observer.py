@@ -21,7 +21,7 @@ FORGET_AFTER_S: Final = 60.0
 MAX_ABSENT_CARS: Final = 256
 """Maximum number of remembered cars without a gateway. The car that left first is forgotten first."""
 MAX_UNCONFIRMED_CARS: Final = 256
-"""Maximum unlisted names on the bus that count as cars before they publish their states."""
+"""Maximum number of unlisted names on the bus that count as cars before they publish their states."""
 
 
 @dataclass(slots=True)
@@ -106,12 +106,12 @@ class FleetObserver:
             state.on_sleep(slept_s)
 
     def on_outcome(self, car: str, refusal: Refusal | None) -> None:
-        """Note that a command was refused, or with None that a command succeeded."""
+        """Note the refusal of a command. None means that the command succeeded."""
         if car in self.cars:
             self.cars[car] = replace(self.cars[car], refused=refusal)
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
-        """Add a message. An answer to a query may be old: then `wall_s` is the wall clock. Otherwise it is None."""
+        """Add a message. `wall_s` is the wall clock if a query returned it, as it may be old. Otherwise it is None."""
         key = keys.parse(sample.key)
         topic = None if key is None else topics.TOPICS.get(key.topic)
         if key is None or topic is None:
