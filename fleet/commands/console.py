@@ -141,7 +141,7 @@ examples:
     type=click.Path(path_type=Path, dir_okay=False),
     default=Path("fleet.yaml"),
     show_default=True,
-    help="The page Set up writes links into FILE.",
+    help='File into which the page "Set up" writes links.',
 )
 @starter_option()
 @click.option("--open", "opens", is_flag=True, help="Open the page in the browser.")

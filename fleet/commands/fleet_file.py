@@ -1,6 +1,6 @@
-"""`fleet init, schema`: writes and describes fleet files. For other commands, reads them and asks the user.
+"""`fleet init, schema`: writes and describes fleet files. No car moves.
 
-No car moves.
+Other commands use this module to read fleet files and to ask the user.
 """
 
 import json
@@ -254,7 +254,7 @@ def _error_without_answer(error: click.Abort, instead: str) -> click.Abort | cli
 
 
 def _prompt_check(rule: Callable[[str], str]) -> Callable[[str], str]:
-    """Return a function that applies the rule to an answer. After an error of it, `prompt` repeats its question."""
+    """Return a function that applies the rule to an answer. If the answer breaks the rule, `prompt` asks again."""
 
     def check(text: str) -> str:
         try:

@@ -437,7 +437,7 @@ def wait(
     connect: str | None,
     fleet: str,
 ) -> None:
-    """Wait until CONDITION is true for a reading of KEY, and print it. The latest one counts, too, unless it is stale.
+    """Wait until CONDITION is true for a reading of KEY, and print it. The latest reading counts, unless it is stale.
 
     If KEY has a wildcard, one matching key is enough. CONDITION is written as for `fleet watch --when`. With --ready,
     wait for cars instead. A car is ready when its link is open and the state of its motors is known.

@@ -340,7 +340,7 @@ def no_cars(client: Fleet) -> click.ClickException:
     if refused := why_refused(client):
         return click.ClickException(refused)
     words = "No car is connected."
-    if running := describe_running(client.bus.endpoint):  # they may be about to reconnect to a restarted hub
+    if running := describe_running(client.bus.endpoint):  # gateways may be about to reconnect to a restarted hub
         words = f"No car is connected, but {running}. Repeat this in a few seconds. Otherwise go to the cars."
     return click.ClickException(words)
 

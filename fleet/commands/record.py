@@ -133,7 +133,7 @@ conditions under `pin:` in the fleet file, are removed last. Files of marked ses
     "--site",
     default="",
     metavar="SITE",
-    help="Record at this site, beside the fleet's main recorder. That one answers all commands while it is reachable.",
+    help="Record at this site, beside the main recorder, which answers all commands while it is reachable.",
 )
 @connect_option()
 @fleet_option()
@@ -336,7 +336,7 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
         first = _ask(bus, fleet, RecorderVerb.STATUS)
         _show_status(first, as_json=as_json)
         for site, found in site_recordings(bus, fleet):
-            if found.session != first.session:  # otherwise this recorder has answered for the fleet above
+            if found.session != first.session:  # otherwise this recorder has already answered above
                 _show_status(found, as_json=as_json, site=site)
 
 
