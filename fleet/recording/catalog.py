@@ -2,8 +2,9 @@
 
 `sensor_range` has the messages of `sensor/range` of every car in every session, with the columns of
 `fleet sessions export` and the name of the `session`. `sensor_range_context` adds what was true at that time: the mode
-as commanded and as seen, the motion, who drove, and the phase of the plan. Topics without a message have views, too.
-`owner` and `driver` in it are persons. `sender` and other columns are as recorded. `person_of(sender)` is the person.
+as commanded and as seen, the motion, who drove, and the phase of the plan. The columns `owner` and `driver` that it
+adds are persons. `sender` and other columns are as recorded: `person_of(sender)` is the person. Topics without a
+message have views, too.
 
 A view is defined only when a question names it, because DuckDB then opens its files: a thousand sessions have twenty
 files each.
@@ -293,7 +294,7 @@ class _Cast:
     files: tuple[str, ...]
 
     def count(self) -> str:
-        """Return the SQL that counts for each session the values that only the conversion to our type makes null."""
+        """Return the SQL that counts, for each session, the values that cannot be converted to our type."""
         files, column = ", ".join(map(_text, self.files)), _quoted(self.column)
         return (
             f"SELECT {_SESSION}, count(*) FROM read_parquet([{files}], filename=true) "  # noqa: S608 - quoted

@@ -35,7 +35,7 @@ REMOVED_FILE: Final = "removed.json"
 TABLES_PREFIX: Final = ".tables-"
 """Prefix of directories with tables for SQL questions (table_cache.py)."""
 SPARE_BYTES: Final = 256 * 1024
-"""Reserved space: enough for the drops by key of 100 cars. Copy-on-write file systems (btrfs) may not honor it."""
+"""Reserved space: enough to list the drops of 100 cars by key. Copy-on-write file systems (btrfs) may not honor it."""
 FLEET_FILE: Final = "fleet.yaml"
 PLAN_FILE: Final = "plan.yaml"
 SEGMENTS: Final = "[0-9][0-9][0-9][0-9].mcap"
@@ -84,7 +84,7 @@ class SessionInfo:
     stops: int | None = None
     """Number of recorded commands that stop cars. None if nobody has counted them."""
     pins: Sequence[Mapping[str, Any]] = ()
-    """Times that the quota removes last, without those of marks, as `Pin.to_dict` writes them."""
+    """Times that the quota removes last, as `Pin.to_dict` writes them. The times around marks are not listed here."""
     gone: Sequence[Mapping[str, Any]] = ()
     """Segments that the quota has removed: `file`, `from`, `to` (ISO 8601), `messages` (null if unknown), `pinned`."""
     origin: Mapping[str, Any] = field(default_factory=dict)

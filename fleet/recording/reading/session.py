@@ -266,7 +266,7 @@ class Session:
         reading the last minute of a long session takes no longer than reading a session of one minute.
         With `decode`, yield readings, as `Fleet.watch` does; messages that cannot be decoded are counted in `left_out`.
         Without it, yield payloads as they were on the bus.
-        Raises NoTable if `keys` is one name without wildcards that is no known topic and not in this session.
+        Raises NoTable if `keys` is a single name without wildcards, and neither a known topic nor in this session.
         """
         selection = self.selection(keys, start_ns, end_ns)
         if isinstance(keys, str) and not is_known(keys) and self._lacks(selection):

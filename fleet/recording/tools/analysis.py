@@ -76,7 +76,7 @@ def _warn(words: str) -> None:
 
 
 def stray_tables(rows: Iterable[Row]) -> "dict[str, pa.Table]":
-    """Return the tables of messages of another type than their key calls for, and of messages that are not protobuf."""
+    """Return tables of the messages whose type is not that of their key, and of those that are not protobuf."""
     decoder = MessageDecoder()
     tables, _ = arrow_tables(row for row in rows if decoder.class_of(row[0]) is None or is_stray(row[0]))
     return {name: table.sort_by(TIME) for name, table in tables.items()}

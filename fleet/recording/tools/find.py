@@ -136,7 +136,7 @@ def find_in(
 def _messages(
     session: Session, selection: Selection, expression: Expression, left_out: LeftOut
 ) -> Iterator[tuple[str, RecordedMessage[tuple[str, Any]]]]:
-    """Yield each message with its car. Those of the condition's topics that have none of its values are left out."""
+    """Yield each message with its car. Leave out messages of the condition's topics that have none of its values."""
     names: dict[str, list[str]] = {}
     for name in expression.names:
         names.setdefault(topic_of(name), []).append(name)

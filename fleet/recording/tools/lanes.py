@@ -3,7 +3,7 @@
 The console draws them live, and for a session. Times are by one clock that the caller chooses, ns since the epoch. For
 a session this is the recorder's clock, because the clock of a gateway may be wrong.
 
-A state lasts until the next one, but not longer than until it is stale. So nothing is drawn for times without messages.
+A state lasts until the next one, or until it is stale. So nothing is drawn for times without messages.
 A stop begins when it arrived, and ends with its last event.
 """
 
@@ -30,7 +30,7 @@ MAX_SPANS: Final = 4096
 """Maximum number of spans of one lane. The oldest are forgotten. Even if a car changes each second, this is enough for
 more than an hour."""
 MAX_OPEN_STOPS: Final = 64
-"""Maximum number of stops of a car without an end. There may be some, because their last events may be lost."""
+"""Maximum number of stops without an end that are kept for a car. A stop has no end if its last event was lost."""
 NOT_HEARD: Final = "not heard"
 """Words of a loss during which the car's gateway published nothing."""
 _MOVING: Final = frozenset(Motion) - {Motion.STOP}

@@ -15,7 +15,7 @@ from schemas.words import UNKNOWN, Mode, Verdict
 MODE: Final = TOPICS["state/mode"]
 assert MODE.stale_after_s is not None
 _HOLDS_NS: Final = round(MODE.stale_after_s * 1e9)
-"""A state lasts until the next one, but not longer than until it is stale."""
+"""A state lasts until the next one, or until it is stale."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,7 @@ def read_between(session: Session, expressions: tuple[str, ...], from_ns: int, t
 
 
 def thinned(session: Session, expressions: tuple[str, ...], from_ns: int, to_ns: int, step_ns: int) -> Iterator[Known]:
-    """Yield messages as `read_between`, of each key at most one in each step of time."""
+    """Yield messages as `read_between` does, but at most one of each key in each step of time."""
     yield from _decoded(one_a_step(session.rows(Selection(expressions, from_ns, to_ns + 1)), step_ns))
 
 

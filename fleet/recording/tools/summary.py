@@ -18,7 +18,7 @@ from schemas import keys
 
 MARK_TOPIC_NAME: Final = "@recorder/mark"
 RECENT_WRITE_S: Final = 5.0
-"""Maximum age of the last write for an unclosed session to count as being recorded. A recorder flushes every second."""
+"""An unclosed session that was written within this time counts as being recorded. A recorder flushes every second."""
 MAX_GROWTH_WAIT_S: Final = 2.5
 """Timeout for an unclosed session to grow. A recorder writes at least its own status every second."""
 GROWTH_POLL_INTERVAL_S: Final = 0.1
@@ -64,7 +64,7 @@ class SessionSummary:
     kept: bool = False
     """True if the quota spares the session."""
     pins: Sequence[Mapping[str, Any]] = ()
-    """Times that the quota removes last, without those of marks."""
+    """Times that the quota removes last. The times around marks are not listed here."""
     gone: Sequence[Mapping[str, Any]] = ()
     """Files that the quota has removed."""
     keys: Mapping[str, int] = field(default_factory=dict)
@@ -231,7 +231,7 @@ def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[t
 
 
 def _state(session: Session, read: Session) -> tuple[SessionState, str]:
-    """Return the state, and its reason. `read` is the damage of the files that have no usable index, and were read."""
+    """Return the state, and its reason. `read` has the damage of the files that were read for lack of an index."""
     description = session.description
     if session.damage:
         return SessionState.DAMAGED, session.damage_words

@@ -51,8 +51,8 @@ _NOTE: Final = "damage"
 """Name of the file that describes the parts of the session that could not be read."""
 _FOREIGN: Final = ".foreign.parquet"
 _OPEN: Final = "recording"
-"""Name of the empty file that says that the session was being recorded. If the recorder has not closed it since, the
-session was cut."""
+"""Name of the empty file that says that the session was being recorded when its tables were made. If the recorder has
+not closed the session since, it was cut."""
 _LEFT_OUT: Final = "left_out"
 """Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
 _STAMP: Final = "stamp-"
@@ -60,8 +60,8 @@ _STAMP: Final = "stamp-"
 _FORMAT: Final = "4"
 """Increase it if the contents of a directory change, so that all directories are made again."""
 STALE_PART_S: Final = 600.0
-"""Minimum age of the last change in an unfinished directory to count as left by a killed process. A running process
-writes to a table every few seconds."""
+"""If nothing changes in an unfinished directory for this time, its process was killed. A running process writes to a
+table every few seconds."""
 _MAX_TRIES: Final = 4
 """Maximum number of attempts to make tables. Another question may delete them if the session has grown meanwhile."""
 
@@ -278,7 +278,7 @@ class _State:
     segments: tuple[str, ...]
     """Each segment with its size and time."""
     description: tuple[str, ...]
-    """Size, time and number of the files that describe the messages: each change replaces the file."""
+    """Size, time and inode of the files that describe the messages. Each change makes a new inode."""
 
     @classmethod
     def of(cls, session: Path) -> Self:

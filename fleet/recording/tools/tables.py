@@ -1,7 +1,8 @@
 """Converts messages to tidy tables: one table per message type, one row per message. Pure, without file formats.
 
-Every table begins with the same columns. `car` comes from the key, so the field of a message is left out. A field with
-a unit has it in its name (`rx_bytes`, `uptime_s`), as in `fleet get --csv`. Values that were not measured are None.
+Every table begins with the same columns. `car` comes from the key, so the field `car` of a message is left out. A field
+with a unit has it in its name (`rx_bytes`, `uptime_s`), as in `fleet get --csv`. Values that were not measured are
+None.
 The request of a command has a column for each field (`request_motion`). It is None if the request was for another
 command.
 """

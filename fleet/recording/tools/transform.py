@@ -99,7 +99,8 @@ def cut(
 ) -> int:
     """Write a part to a new session, and return its number of messages.
 
-    With `cars`, only messages of these cars and of services. Raises Exists, OSError, and NoSession for an empty part.
+    With `cars`, write only messages of these cars and of services. Raises Exists, OSError, and NoSession for an empty
+    part.
     """
     names = frozenset(cars)
 

@@ -17,7 +17,7 @@ from schemas.local_time import exact
 from schemas.printable import printable
 
 MAX_CLOCK_OFFSET_S: Final = 0.5
-"""Maximum offset between the publisher's and the recorder's clock that is not reported."""
+"""A larger offset of a publisher's clock from the recorder's clock is reported."""
 MAX_LISTED_LINES: Final = 20
 """Maximum number of gaps to print. --json lists all."""
 

@@ -13,8 +13,8 @@ FREE_WARNING_FACTOR: Final = 4
 MIN_START_BYTES: Final = 500_000
 """Minimum free space above the reserve to begin a session."""
 MAX_RESUME_BYTES: Final = 5 * MB
-"""Maximum space above the reserve to wait for before resuming. If it were less, the recorder would write one file of a
-second after the other. If it were more, recording might never resume on a small disk."""
+"""Maximum space above the reserve to wait for before resuming. With less, the recorder would write many files of one
+second each. With more, recording might never resume on a small disk."""
 PROBE_BYTES: Final = 4096
 """Size of the test file that shows whether a directory can be written: one block of most disks."""
 MIN_CLOSE_BYTES: Final = 200_000

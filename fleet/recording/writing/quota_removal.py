@@ -25,7 +25,7 @@ from fleet.recording.writing.quota_choice import Spans, StoredSegment, StoredSes
 MAX_REMOVED: Final = 1000
 """Maximum number of removed sessions in `removed.json`, with 200 bytes each. The newest ones are listed."""
 _UNCLOSED_IN_USE_S: Final = 60.0
-"""Age below which an unclosed session may still belong to another recorder."""
+"""An unclosed session that was written within this time may still belong to another recorder."""
 
 
 @dataclass(slots=True)

@@ -40,8 +40,8 @@ from schemas.words import Level, RecorderState, RecorderVerb
 
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
-"""Maximum size of the queue to the writer. This is some seconds of 100 cars, and little memory even for a small
-computer."""
+"""Maximum size of the queue to the writer. It holds what 100 cars publish in some seconds, and needs little memory even
+on a small computer."""
 FLUSH_INTERVAL_S: Final = 1.0
 """Interval of flush and status. A crash loses at most the messages of this time."""
 READ_INTERVAL_S: Final = 0.01
@@ -55,8 +55,8 @@ MAX_READ_BATCH: Final = 4_096
 SHUTDOWN_DRAIN_S: Final = 0.3
 """At shutdown, wait this long for messages in transit, and then at most this long for an answer of the hub."""
 MAX_DRAIN_DELAY_S: Final = 0.2
-"""If both waits together last longer than SHUTDOWN_DRAIN_S by more than this, the hub or the recorder stood still. Then
-both are repeated."""
+"""Maximum time for both waits beyond SHUTDOWN_DRAIN_S. If they last longer, the hub or the recorder stood still, and
+both waits are repeated."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
@@ -116,8 +116,8 @@ class Recorder:
         self._options = options or Options()
         self._pin_rules = pins
         self._read_people = people
-        """Returns the people in the fleet file, who may start and stop the recorder. If it is None, the people that the
-        gateways know may."""
+        """Returns the people in the fleet file, who may start and stop the recorder. If it returns None, the people
+        whom the gateways know may."""
         self._pin_watch = PinWatch(pins)
         self._max_messages = max_messages
         self._max_bytes = max_bytes
@@ -456,7 +456,7 @@ class Recorder:
                 raise _CommandRefused(f"There is no command {verb!r}. There are {', '.join(RecorderVerb)}.")
 
     def _check_sender(self, query: zenoh.Query, verb: str) -> None:
-        """Refuse a command that only leads may send, by the same rule as for the plan.
+        """Refuse the command if its sender may not send it. The rule is that of the plan: only leads may.
 
         Without `people:` everyone may.
         """

@@ -72,9 +72,9 @@ class RecorderService:
         self._marks = self._bus.publisher(self.mark_key, MARK_TOPIC, keys.RECORDER)
 
     def open(self, on_query: Callable[[zenoh.Query, str], object]) -> None:
-        """Answer queries from now on. on_query: as for `Bus.queryable`. It gets the queries for this recorder.
+        """Answer queries from now on. on_query: called with each query for this recorder, as by `Bus.queryable`.
 
-        It also gets the key of the answer, because a query may have wildcards.
+        It is also called with the key of the answer, because a query may have wildcards.
         """
 
         def for_fleet(query: zenoh.Query) -> object:

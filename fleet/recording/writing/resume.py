@@ -10,7 +10,7 @@ from fleet.recording.time_spec import iso_ns
 from schemas.topics import CACHE_S
 
 RESUME_WINDOW_S: Final = 3 * CACHE_S
-"""Length of the end of an interrupted session that publishers may still cache."""
+"""Time before the end of an interrupted session from which publishers may still cache messages."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,7 +88,8 @@ class SessionWriter:
         """Keys with new gaps, each with the time of the last message before the gap (0 if there was none). The recorder
         requests a backfill for them and clears them."""
         self._drops: dict[str, int] = {}
-        """Messages by key that were lost to a full disk, or to a full queue if they had no number."""
+        """Lost messages by key: those that did not fit on the disk, and those without a number that did not fit into
+        the queue."""
         self._overflows: dict[str, int] = {}
         """Numbered messages by key that did not fit into the recorder's queue. A backfill may still fetch them."""
         self.recovered: dict[str, int] = {}
@@ -106,8 +107,8 @@ class SessionWriter:
         self._written = self._closed_bytes = self._buffered_bytes = 0
         self._stops = StopCount()
         self._unended = 0
-        """Number of rows at the beginning of the buffer that are in a segment whose end did not fit on the full
-        disk."""
+        """Number of rows at the beginning of the buffer that are already in the segment. The end of this segment did
+        not fit on the full disk."""
         self._unflushed: list[Row] = []
         self._reset_segment(now_ns)
         self._open(now_ns, self._options.reserve.to_begin)
@@ -232,7 +233,7 @@ class SessionWriter:
 
     @property
     def missed(self) -> dict[str, int]:
-        """Return the publications by key that never came, from gaps in their sequence numbers."""
+        """Return the number of publications by key that never came, from gaps in the sequence numbers."""
         counts = {key: self._trackers[key].missing - self._unrestored(key) for key in sorted(self._irregular_keys)}
         return {key: count for key, count in counts.items() if count}
 
@@ -418,7 +419,7 @@ class SessionWriter:
     def _on_write_error(self, error: OSError) -> None:
         """If the disk is full, pause, and keep the unflushed messages in the buffer. Raise any other error.
 
-        The segment stays as at its last flush. Its end is kept in memory until there is room for it.
+        The segment stays as it was after the last flush. Its end is kept in memory until there is room for it.
         """
         if not session_dir.is_full(error):
             raise error
