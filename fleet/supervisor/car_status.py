@@ -15,9 +15,9 @@ from schemas.words import LinkState
 MAX_CARS_LISTED: Final = 8
 """Maximum number of cars that one line lists."""
 READY_TIMEOUT_S: Final = 30.0
-"""A start ends if no further car becomes ready for this time, although some are missing."""
+"""A start ends when no further car has become ready for this time, even if some are missing."""
 LINK_OPEN_TIMEOUT_S: Final = 10.0
-"""The timeout in place of READY_TIMEOUT_S if everything runs, and only links of cars cannot be opened."""
+"""The timeout in place of READY_TIMEOUT_S if all that is missing is cars whose links cannot be opened."""
 REACHED_S: Final = 2.0
 """Time for which a link must be open to count as a link to a car, if the car sends nothing."""
 RATE_WINDOW_S: Final = 2.0
@@ -100,7 +100,7 @@ class CarStatus:
 
 @dataclass(slots=True)
 class StartProgress:
-    """The progress of a start: the smallest number of missing cars and services so far, and the time since then."""
+    """The progress of a start: the smallest number of missing cars and services so far, and when it was reached."""
 
     fewest: int | None = None
     since: float = 0.0
@@ -108,7 +108,7 @@ class StartProgress:
     def has_ended(self, missing: int, now: float, *, unreachable: bool) -> bool:
         """Return True if no car or service is missing, or if none has become ready for a while.
 
-        `unreachable` is True if only links of cars cannot be opened.
+        `unreachable` is True if all that is missing is cars whose links cannot be opened.
         """
         if self.fewest is None or missing < self.fewest:
             self.fewest, self.since = missing, now

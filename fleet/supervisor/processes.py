@@ -142,7 +142,7 @@ class ProcessSet:
         silent = {process.name: process.status.silent_s(now, since(process)) for process in self}
         judged = [process for process in self.of(*_HEARTBEAT_KINDS) if process.status.state is RunState.RUNNING]
         many = have_common_cause(sum(silent[process.name] > MISSED_HEARTBEAT_S for process in judged), len(judged))
-        # Start the process first that has waited longest. So a few processes that crash again and again do not delay
+        # First start the process that has waited longest. So a few processes that crash again and again do not delay
         # the others.
         for process in sorted(self, key=lambda each: each.status.due):
             if silent[process.name] > CPU_CHECK_SILENCE_S and process.child is not None and process.pulse.is_due(now):

@@ -61,8 +61,8 @@ class GatewayShutdown:
         self._tries: dict[str, int] = {}
         """Number of new gateways that were started to stop a car."""
         self._unclaimed: dict[str, float] = {}
-        """Gateways that ended normally before their last state arrived, each with the time at which the wait for it
-        ends."""
+        """Gateways that ended normally before their last state arrived, each with the time until which this state is
+        awaited."""
         self.results: dict[str, str] = {}
         """Result by car. Cars that a reload removed are not in it."""
 

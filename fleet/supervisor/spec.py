@@ -218,7 +218,7 @@ def _car(spec: FleetCar) -> CarProcessSpec:
 
 
 def _people(car: str, people: Mapping[str, FleetPerson]) -> tuple[str, ...]:
-    """Return the options of a gateway that name the people who drive its car, and those who drive only others."""
+    """Return the options that tell a gateway who may drive its car, and who may drive only other cars."""
     named = [
         f"{name}:lead" if person.rank is PersonRank.LEAD else name if person.may_drive(car) else f"{name}:other"
         for name, person in people.items()

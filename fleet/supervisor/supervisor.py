@@ -119,7 +119,7 @@ class Supervisor:
         self._shown: object = None
         self._session = ""
         self._recorder_heard_at = inf
-        """The time at which the last status of a recorder of this fleet came."""
+        """The time of the last status from any recorder of this fleet."""
         self._unrecorded = ""
         """Why not everything is recorded, although it should be."""
         self._console = ""
@@ -259,7 +259,7 @@ class Supervisor:
             hub.status.schedule(now)
 
     def _check_recorder(self, now: float) -> None:
-        """Report that nothing is recorded, if our recorder does not run and no other one of this fleet is heard."""
+        """Report that nothing is recorded, if our recorder does not run and no other recorder is heard."""
         recorder = self.processes.get(RECORDER)
         if recorder is None or self._shutdown_requested.is_set() or now < self._recorder_heard_at + RECORDER_LOST_S:
             return

@@ -40,7 +40,7 @@ SUBSCRIPTIONS: Final = (
     f"{keys.COORDINATOR}/plan",
 )
 MAX_QUEUED_SAMPLES: Final = 8192
-"""Maximum number of queued messages. This is some seconds of a hundred cars."""
+"""Maximum number of queued messages. A hundred cars publish as many in some seconds."""
 MAX_SUPERVISOR_QUERIES: Final = 64
 SUPERVISOR_COMMANDS: Final = {"down": "fleet.v1.DownCommand", "reload": "fleet.v1.ReloadCommand"}
 """The supervisor's commands, with the message type of the payload."""
