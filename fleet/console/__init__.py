@@ -7,10 +7,10 @@ shows more than the cars has a `page_feed`, which registers the messages that th
 `people_file` and `people_routes`. Its connections come in through `entrance`. `sessions_api` works on recordings,
 `session_files` guards their folder, `plan_process` starts a coordinator, and `setup_api` finds cars. Work that takes
 seconds runs in a `worker`: `plan_checks`, and `past_worker`, which answers the questions of `past_api`. These modules
-are pure: `hold_to_drive` (how long a car drives: the dead-man), `request_filter` (which requests are answered),
-`pairing` (codes, cookies and people), `rights_in_words` (who may do what), `waiting_room` (who may begin TLS),
-`connection_limit`, `page_requests`, `car_view`, `past_view`, `command_ledger`, `plan_view`, `plan_answer`, `frame_log`,
-`plot_buffer`, `abilities` and `stop_report`.
+are pure: `hold_to_drive` (the dead man's switch: how long a car drives), `request_filter` (which requests are
+answered), `pairing` (codes, cookies and people), `rights_in_words` (who may do what), `waiting_room` (who may begin
+TLS), `connection_limit`, `page_requests`, `car_view`, `past_view`, `command_ledger`, `plan_view`, `plan_answer`,
+`frame_log`, `plot_buffer`, `abilities` and `stop_report`.
 """
 
 from typing import Final

@@ -42,7 +42,7 @@ MAX_BUDGETS: Final = 1024
 """Maximum number of remembered persons, devices and strangers. Beyond it, the one that was idle the longest is
 forgotten."""
 MERGE_S: Final = 0.1
-"""Time within which further STOPs of one person are merged into one, which follows at its end."""
+"""Time within which further STOPs of one person are merged into one. This one follows at the end of the time."""
 TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
 
 TOO_MANY_PLANS: Final = "Too many plans of this person wait for a check. Try again in a few seconds."
@@ -68,7 +68,7 @@ class Budgets:
 
     _all: dict[Hashable, _Budget] = field(default_factory=dict)
     _open: Counter[Hashable] = field(default_factory=Counter)
-    """The number of commands without an outcome, of each device that has any."""
+    """Number of commands without an outcome, by device."""
 
     def may_send(self, device: Hashable, page: TokenBucket, now: float) -> bool:
         """Count a message.

@@ -98,7 +98,10 @@ class CarView:
         return self._since if self._heard_at is None else self._heard_at
 
     def on_message(self, topic: str, value: Any, now: float, wall_ns: int | None = None) -> None:
-        """Handle a message of this car, on a topic such as `sensor/range`. `wall_ns` is our clock, if it is new."""
+        """Handle a message of this car, on a topic such as `sensor/range`.
+
+        `wall_ns` is the time by our clock if the message was published just now, else None.
+        """
         if wall_ns is not None and topic.startswith("state/"):
             self._clock.take(value.boot_id, messages.stamp_ns(value.stamp), wall_ns)
         if topic not in topics.FROM_OUTSIDE:
@@ -121,7 +124,7 @@ class CarView:
                     self.authority, self.names_people = Authority.of(value), True
 
     def on_presence(self, now: float, *, present: bool) -> None:
-        """Handle that the car's gateway has joined or left the bus."""
+        """Note whether the car's gateway is on the bus."""
         if self._changed_at is None:
             self.state.present = present
         elif present is self.state.present:
@@ -141,7 +144,10 @@ class CarView:
         return describe_gateway(*(self.state.of(f"state/{name}") for name in ("link", "health", "safety", "mode")))
 
     def diagnose(self, now: float) -> dict[str, Any]:
-        """Return what `fleet doctor` says of the car, as far as its messages tell. A fact: name, words, in doubt."""
+        """Return what `fleet doctor` says of the car, as far as its messages tell.
+
+        Each fact has a name, words, and True if it is in doubt.
+        """
         state = self.state if self._changed_at is not None else CarState(self.name, present=False)
         evidence = CarEvidence(
             state, now, [(now - at, event) for at, event in self._events], clock_off_s=self._clock.off_s
@@ -312,7 +318,10 @@ class FleetView:
         return self._cars[name]
 
     def _make_room(self, most: int, silent_since: float) -> bool:
-        """Forget unlisted cars until `most` are left, the longest silent first. False if one was heard since then."""
+        """Forget unlisted cars until `most` are left, the longest silent first.
+
+        Return False if this would forget a car that was heard after `silent_since`.
+        """
         others = [car for name, car in self._cars.items() if name not in self._listed]
         for car in sorted(others, key=lambda car: car.last_sign_at)[: max(0, len(others) - most)]:
             if car.last_sign_at >= silent_since:
@@ -326,7 +335,7 @@ class FleetView:
         return name in self._cars or name in self._listed
 
     def look_up(self, name: str) -> CarView:
-        """Return the view of a car, an empty one if there is no such car. It is not kept: a page may name any car."""
+        """Return the view of a car. An unknown car gets an empty view, which is not kept: a page may name any car."""
         return self._cars.get(name) or CarView(name, "")
 
     def update_colors(self) -> None:

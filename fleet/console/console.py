@@ -133,7 +133,7 @@ class Console:
             "echo": self._on_echo,
             "press": self._on_press,
             "release": self._on_release,
-            # A page measures with it how long its messages take.
+            # A page sends it to measure how long its messages take.
             "ping": lambda page, message: page.answer(t="pong", id=message.number("id")),
             Verb.STOP: lambda page, message: self.stop_all(message.text("id"), page.operator),
             Verb.ESTOP: self._on_estop,
@@ -219,7 +219,7 @@ class Console:
         while True:
             now = time.monotonic()
             self._end_presses_of_sleep()
-            if not self._fleet.sync.bus.connected:  # a press still held must not drive when it is back
+            if not self._fleet.sync.bus.connected:  # a press still held must not drive when the bus is back
                 for press in self._presses.on_bus_lost():
                     self._end(press, _BUS_LOST)
             for press in self._presses.expire(now):
@@ -522,7 +522,7 @@ class Console:
     def _on_pause(self, page: PageLink, message: PageMessage) -> None:
         why = message.text("why", MAX_REASON_LENGTH)
         if refused := rights_of(page.operator.sender, self._view.authority)["pause"]:
-            raise BadPageMessage(refused)  # it stops no car, so it ends no press
+            raise BadPageMessage(refused)  # a refused pause stops no car, so it ends no press
         self.stop_all(message.text("id"), page.operator, pause_request(why))
 
     def _on_unpause(self, page: PageLink, message: PageMessage) -> None:

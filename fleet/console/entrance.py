@@ -24,8 +24,8 @@ ACCEPT_PAUSE_S: Final = 0.01
 """Pause after a full turn. So at most 2000 connections a second are accepted, in a tenth of a core. The others wait in
 the kernel."""
 SERVE_INTERVAL_S: Final = 0.02
-"""Interval at which a line that has used up its rate is checked. It is shorter than the interval between two handshakes
-of one address."""
+"""Interval at which a waiting line that has used up its rate is checked. It is shorter than the interval between two
+handshakes of one address."""
 EXPIRY_INTERVAL_S: Final = 0.25
 """Interval at which silent connections are ended."""
 HANDSHAKE_TIMEOUT_S: Final = 3.0

@@ -1,4 +1,4 @@
-"""Hold to drive: the dead-man of the pages. Pure: time is an argument (s, monotonic).
+"""Hold to drive: the dead man's switch of the pages. Pure: time is an argument (s, monotonic).
 
 The server numbers its ticks. While the finger is down, the page echoes each tick with the id of its press.
 """
@@ -86,7 +86,7 @@ class PressBook:
 
         Return the press, and the presses of other pages that it ends: a lead takes cars from persons who are not leads.
         An id counts once: a press that is over never begins again, not even by a late message. person: the person at
-        the page. people: those of all these cars.
+        the page. people: the people of these cars.
         """
         if press_id <= self._newest_ids.get(client, -1):
             raise PressRefused("This press is over. Press again.")
@@ -155,9 +155,9 @@ class PressBook:
         return self._end(lambda press: bool(cars & set(press.cars)))
 
     def drop_cars_of(self, cars: set[str], person: str, people: People = NO_PEOPLE) -> list[HeldPress]:
-        """End the presses of these cars that a command of this person, other than a stop, may end.
+        """End presses of these cars, because this person sent them a command that is not a stop.
 
-        Those are the person's own presses. A lead of the cars also ends the presses of persons who are not leads.
+        The person's own presses end. A lead of the cars also ends the presses of persons who are not leads.
         """
         sender = Sender(person, Rank.PERSON)
         return self._end(

@@ -29,7 +29,7 @@ class MapFeed(PageFeed):
         self._has_place = has_place
         self._samples: Latest[Sample] = Latest(_MAX_MAP_KEYS)
         self._pages: dict[int, float] = {}
-        """Up to which time each page has the trails, by page."""
+        """The time up to which each page has the trails, by page."""
         self._world = ""
         self._ticks = 0
 

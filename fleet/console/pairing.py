@@ -30,7 +30,7 @@ MAX_CODES: Final = 16
 MAX_DEVICES: Final = 256
 """Maximum number of paired devices. A new one replaces the oldest."""
 FREE_GUESSES: Final = 5
-"""Wrong codes of one address before it must wait."""
+"""Number of wrong codes after which an address must wait."""
 MAX_GUESS_DELAY_S: Final = 300.0
 GUESS_MEMORY_S: Final = 3600.0
 """Time after which the wrong codes of an address are forgotten."""

@@ -30,11 +30,11 @@ MOMENT_TIMEOUT_S: Final = 20.0
 """Timeout of a moment. It takes 0.2 s with twenty cars, and ten times as long with the lowest share of a processor. The
 start of the process takes up to 10 s."""
 IDLE_READER_S: Final = 300.0
-"""Time after the last question at which the processes end. Until then, a person may be looking at what a jump shows."""
+"""Time without a question after which the processes end. A person may look at the result of a jump for minutes."""
 MAX_OPEN_LOOKS: Final = 2
 """Maximum number of questions of one person that wait. A page asks for only one moment at a time."""
 _MAX_MS: Final = 2**53
-"""Largest whole number up to which JavaScript represents all exactly."""
+"""JavaScript represents every whole number up to this one exactly."""
 _TOO_MANY: Final = "Other looks of this person at recordings have no answer yet. Try again in a few seconds."
 
 

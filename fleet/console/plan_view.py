@@ -54,7 +54,7 @@ class PlanView:
         return self._plan.text, roles, self._assignment.phase
 
     def on_presence(self, *, running: bool) -> None:
-        """Handle that the coordinator is on the bus, or not."""
+        """Note whether the coordinator is on the bus."""
         self.changed = self.changed or running is not self._running
         self._running = running
 

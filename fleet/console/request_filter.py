@@ -39,7 +39,7 @@ DEVICE: Final = "fleet.device"
 """Where the scope of a request from the network has the id of its `PairedDevice`."""
 PAIR_PATH: Final = "/pair"
 PUBLIC_PATHS: Final = frozenset({PAIR_PATH, "/static/pair.js", "/static/style.css"})
-"""Everything that a device which is not paired can read."""
+"""Everything that an unpaired device can read."""
 _HTTPS_PORT: Final = 443
 
 

@@ -61,7 +61,7 @@ class WaitingRoom:
     _total: TokenBucket = field(default_factory=lambda: TokenBucket(TOTAL_RATE, TOTAL_BURST))
 
     def add(self, key: Hashable, address: str, now: float) -> Hashable | None:
-        """Add a connection. Return the key of one that loses its place for it, perhaps of the new one itself."""
+        """Add a connection. Return the key of the connection that loses its place for it, perhaps the new one's."""
         line = self._lines.setdefault(address, _AddressLine())
         line.silent[key] = now
         self._forget_idle()
