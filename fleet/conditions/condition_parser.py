@@ -129,7 +129,7 @@ class _Parser:
         yield _Token("end", "", len(self._text) + 1)
 
     def _fail_at(self, at: int) -> Never:
-        """Raise the error for the text from this position on, with which no token begins."""
+        """Raise the error for the text at this position, where no token begins."""
         token, rest = _Token("odd", "", at + 1), self._text[at:]
         if rest[0] in "'\"":
             self._fail(token, f"the word that begins with {rest[0]} has no end")

@@ -24,7 +24,7 @@ _FIRST: Final = "the first adapter"
 
 @dataclass(frozen=True, slots=True)
 class AdapterCheck:
-    """The load of one adapter. For `auto`: of all adapters of the computer together."""
+    """The load of one adapter. For `auto`, the load of all adapters of the computer together."""
 
     adapter: str
     cars: tuple[str, ...]

@@ -88,7 +88,7 @@ class FleetPerson:
 
 @dataclass(frozen=True, slots=True)
 class PinRule:
-    """A condition. The time around it, from `before_s` before to `after_s` after it, is pinned in recordings."""
+    """A condition. Recordings are pinned from `before_s` before it becomes true to `after_s` after it ends."""
 
     condition: Expression
     before_s: float
@@ -194,7 +194,7 @@ def parse_fleet(text: str, path: Path, *, unbound: bool = False, moved: bool = F
 
 
 def profile_capabilities(platform: str) -> frozenset[str]:
-    """Return the parts and modes of a platform's cars. For `auto`: of the cars of all platforms."""
+    """Return the parts and modes of a platform's cars. For `auto`, return those of all platforms."""
     profiles = drivers.profiles_of(platform)
     return frozenset(str(word) for profile in profiles for word in (*profile.capabilities, *profile.modes))
 

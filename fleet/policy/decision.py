@@ -48,7 +48,7 @@ class Decision:
     """Time at which the cause became the current one, s on the step's clock."""
 
     def after(self, before: "Decision | None", now: float) -> "Decision":
-        """Return `before`, the last step's decision, if this one says the same in the same words, else this one."""
+        """Return this decision, or `before` (that of the last step) if both say the same in the same words."""
         if before is None or before.cause != self.cause:
             return replace(self, since=now)
         if (before.decided, before.why, before.would_change) == (self.decided, self.why, self.would_change):

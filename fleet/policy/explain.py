@@ -126,7 +126,10 @@ def is_reworded(decision: Decision, before: Mapping[str, Decision]) -> bool:
 def explain_role(
     car: str, held_role: HeldRole, candidates: Candidates, allocation: RoleAllocation, phase: str, last: Decision | None
 ) -> Decision:
-    """Explain a mode that a role gives the car. `last`, its last decision in this phase, is reused if unchanged."""
+    """Explain a mode that a role gives the car.
+
+    `last` is the car's last decision in this phase. If it still applies, it is returned.
+    """
     plan, name = candidates.plan, held_role.role
     role = plan.roles[name]
     pinned = candidates.pinned.get(car)

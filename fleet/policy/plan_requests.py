@@ -12,7 +12,7 @@ from schemas import keys
 from schemas.rights import People
 from schemas.words import Reason
 
-GOES_ON: Final = "`fleet plan restart` or `fleet plan set` goes on"
+GOES_ON: Final = "`fleet plan restart` or `fleet plan set` runs a plan again"
 
 
 class PlanRequest(StrEnum):

@@ -38,7 +38,7 @@ class Barrier:
     looks_at: Expression | None = None
     """The expression from which the barrier follows."""
     ends_role: bool = False
-    """True if a person has taken the car for longer, so that the car loses its role at once."""
+    """True if a person has taken the car for a longer time, so that the car loses its role at once."""
 
 
 class PinnedRole(NamedTuple):
@@ -62,7 +62,7 @@ class Candidates:
     unresponsive: frozenset[str]
     """Cars that were commanded into their mode more than once and are not in it."""
     pinned: Mapping[str, PinnedRole]
-    """By car."""
+    """The roles that rules pin, by car."""
     in_force: frozenset[str]
     """The roles that count in this phase."""
     needs: Mapping[tuple[str, str], Settled]

@@ -176,7 +176,7 @@ class FleetSnapshot:
 
     cars: Mapping[str, CarSnapshot] = field(default_factory=dict)
     readings: Mapping[str, Mapping[str, Observation]] = field(default_factory=dict)
-    """By car and topic."""
+    """The newest messages, by car and topic."""
 
     def holds(self, expression: Expression, car: str, now: float, *, old: bool = False) -> bool | None:
         """Return whether the expression is true for this car, or None if that is not known.

@@ -51,7 +51,7 @@ class Trial:
 
 
 def try_plan(plan: Plan, snapshot: FleetSnapshot, in_force: PlanInForce | None, now: float) -> Trial:
-    """Return the first decisions of this plan for these cars. Conditions with a duration begin only now.
+    """Return the first decisions of this plan for these cars. The durations of conditions are counted from now.
 
     `in_force` is None if no plan runs. Roles and the phase remain if both plans have them, as with `fleet plan set`.
     """
