@@ -1,6 +1,6 @@
 """The rules of a hub: which identity may use which keys, in the form of Zenoh's access control. Pure.
 
-Everything is denied that no rule allows. Everyone with a certificate may read everything and stop every car. Beyond
+A hub denies everything that no rule allows. Everyone with a certificate may read everything and stop every car. Beyond
 that, an identity sends only in its own name:
 
 - The gateway of a car publishes and answers under the keys of its car.

@@ -53,7 +53,7 @@ class KnownIdentity:
     until: str
     """When its certificate expires, ISO 8601, UTC."""
     generation: int = 1
-    """Number of common names that the identity has had. It is part of the common name, except for 1."""
+    """Number of common names that the identity has had. It is part of the common name unless it is 1."""
     revoked: bool = False
     local: bool = False
     """True if its key is on this computer."""
@@ -182,7 +182,7 @@ class HubStore:
 
         addresses: the addresses of the joining computer, if it becomes a hub.
 
-        Raises BadRequestForCertificate (even if the identity was revoked or invited again meanwhile) and OSError.
+        Raises OSError, and BadRequestForCertificate, also if the identity was revoked or invited again meanwhile.
         """
         reserved = self.known[identity]
         with self._changing():
@@ -199,7 +199,7 @@ class HubStore:
     def renew(self, certificate: bytes, request: bytes, identity: str, now: datetime) -> bytes:
         """Return the next certificate of an identity, PEM, for the same key. See `certificate_authority.renew`.
 
-        Raises BadRequestForCertificate (even if the identity is revoked) and OSError.
+        Raises OSError, and BadRequestForCertificate, also if the identity is revoked.
         """
         with self._changing():
             entry = self.known.get(identity)

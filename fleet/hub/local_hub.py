@@ -23,8 +23,8 @@ from schemas.state_dir import JOINED_FILE, STATE_VARIABLE, default_directory, di
 SECURE_ENDPOINT: Final = f"tls/{LOOPBACK}:7447"
 """Endpoint at which programs on the hub's own computer find the hub."""
 JOINED_BYTES: Final = 65_536
-"""Bytes of a test file: more than a joining computer stores (a key, two certificates, at a site the rules of twenty
-identities)."""
+"""Size of a test file. A joining computer stores less: a key, two certificates, and at a site the rules of twenty
+identities."""
 SOMEBODY: Final = "operator"
 """The name of a user whose login is not valid as a person's name."""
 
@@ -69,7 +69,7 @@ def is_hub_here(endpoint: str) -> bool:
 
 
 def is_authority_here(ca: bytes) -> bool:
-    """Return True if this computer has the key of the authority with this certificate, so that it is its hub."""
+    """Return True if this computer has the key of the authority with this certificate. It then is the hub."""
     found = directory_of(SECURE_ENDPOINT).parent.glob(f"*/{DIRECTORY}/{CA_FILE}")
     return any(each.read_bytes() == ca and HubStore(Credentials(each.parent, "")).is_hub for each in found)
 
@@ -84,7 +84,8 @@ def use(endpoint: str) -> None:
 def check_storage(host: str, port: int = 0) -> None:
     """Raise NotJoined if this computer cannot store what it gets when it joins, before a code is used up.
 
-    host: of the hub that this computer will use, empty if it must be found first. port: of that hub, if it is known.
+    host: the host of the hub that this computer will use. Empty if it must be found first. port: the port of that hub,
+    if it is known.
     """
     default = int(SECURE_ENDPOINT.rpartition(":")[2])
     endpoint = f"tls/{host}:{port or default}"

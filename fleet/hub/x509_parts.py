@@ -13,8 +13,8 @@ from cryptography.x509.oid import NameOID
 LIFETIME: Final = timedelta(days=397)
 """Lifetime of a certificate. Browsers reject certificates that last much longer."""
 _BACKDATED: Final = timedelta(days=1)
-"""Time by which certificates begin earlier, because clocks differ. A Raspberry Pi without a network may show
-yesterday's time."""
+"""Certificates are valid from this time before they are made, because clocks differ. A Raspberry Pi without a network
+may show yesterday's time."""
 
 
 def new_key() -> ec.EllipticCurvePrivateKey:

@@ -154,7 +154,7 @@ class PresenceToken:
 def presence(recorded: Iterable[Recorded], end_ns: int) -> list[PresenceToken]:
     """Return when cars appeared and disappeared until `end_ns`, from the messages of STATE_KEYS.
 
-    When a car disappeared is an estimate.
+    The time at which a car disappeared is an estimate.
     """
     last: dict[str, tuple[int, str]] = {}
     found = []

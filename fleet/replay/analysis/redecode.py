@@ -57,8 +57,8 @@ class Counts:
     undecided: int = 0
     """Frames with several possible results."""
     absent: int = 0
-    """Readings that the record of their frame names as published, but that are missing in the session. They were lost
-    on the way to the recorder."""
+    """Readings that are missing in the session, although the record of their frame says that they were published. They
+    were lost on the way to the recorder."""
 
 
 class NoPlatform(Exception):
