@@ -43,7 +43,7 @@ _QUEUE_SIZE: Final = 16_384
 """Maximum number of messages in the queue of one subscription: three seconds of 100 cars."""
 _MAX_BATCH: Final = 4096
 MAX_REOPENED: Final = 10
-"""How often a topic gets a new channel because one refused a client. A client may subscribe to any numbers."""
+"""Maximum number of times that a topic gets a new channel after a refusal. A client may subscribe to any numbers."""
 _REFUSED: Final = re.compile(r"subscribe to unknown channel: (\d+)")
 """The SDK's log message about a client that it refused."""
 _LAST_TIMEOUT_S: Final = 3.0
@@ -169,7 +169,7 @@ class FoxgloveServer:
         return opened
 
     def _reopen_refusing(self) -> None:
-        """Give each topic whose channel refused a client a new one, which all clients hear of."""
+        """Open a new channel for each topic whose channel refused a client. The SDK tells all clients of it."""
         for number in self._refusals.take(self._topics):
             topic = self._topics[number]
             if self._reopened[topic] == MAX_REOPENED:

@@ -14,8 +14,8 @@ from schemas.words import Phase, Reason
 STATUS: Final = f"{keys.RECORDER}/status"
 EVENTS: Final = "event/command"
 MAX_EXPORTED_CARS: Final = 256
-"""Maximum number of cars with metrics, the first by name. Each car has about eighty series, and anybody on an open bus
-may invent cars. The fleet file of a whole hall has some dozens."""
+"""Maximum number of cars with metrics. If there are more, only the first by name have metrics. Each car has about
+eighty series, and anybody on an open bus may invent cars. The fleet file of a whole hall has some dozens."""
 MAX_RECENT_RECORDS: Final = 4096
 """Maximum number of remembered records of commands. They are remembered so that each phase counts once: if a car cannot
 show the effect of a command, the command ends with a second `sent`, at most 18 s later

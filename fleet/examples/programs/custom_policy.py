@@ -9,7 +9,7 @@ from fleet import Fleet
 
 
 def main() -> None:
-    """Run as a coordinator: the gateway of a car that a person has stopped or drives rejects us; try the next car."""
+    """Run as a coordinator. A car that a person has stopped or drives rejects the command: then try the next car."""
     with Fleet(kind="coordinator") as fleet:
         for _ in range(3):
             room = {reading.car: reading["range_m"] or 0.0 for reading in fleet.get("*/sensor/range")}
