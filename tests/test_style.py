@@ -1,6 +1,7 @@
 """Tests rules of names, imports and messages that no linter has. CONTRIBUTING.md explains them."""
 
 import ast
+import itertools
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -85,6 +86,22 @@ def imported(path: Path) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
+
+
+def stray_texts(path: Path) -> Iterator[str]:
+    """Yield the texts that document nothing: neither the first statement of a body, nor after an assignment."""
+    for node in nodes(path):
+        body = getattr(node, "body", None)
+        for before, statement in itertools.pairwise(body if isinstance(body, list) else ()):
+            if isinstance(statement, ast.Expr) and not isinstance(before, ast.Assign | ast.AnnAssign | ast.Assert):
+                value = statement.value
+                if isinstance(value, ast.JoinedStr) or (isinstance(value, ast.Constant) and value.value is not ...):
+                    yield f"{module_name(path)}:{statement.lineno}"
+
+
+def test_text_is_never_a_statement_of_its_own() -> None:
+    """A message of two parts had lost its second one: the parenthesis was closed too early."""
+    assert [each for path in source_files(*PACKAGES) for each in stray_texts(path)] == []
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -67,9 +67,9 @@ SHARP_S = 0.1
 FALSE_S = 0.3
 MODE_STAYS_S = 8.0
 LONGEST_FIRST_FRAMES_S = 1.1 + 1.2 + 4.3
+"""Maximum time for which the first frames of a stop delay a command: their length, the block before and a turn."""
 LONGEST_STOP_S = 18.0
 """Maximum time within which a car shows a stop, if it can (docs/reference/protocol.md#repeated-stops)."""
-"""Maximum time for which the first frames of a stop delay a command: their length, the block before and a turn."""
 
 
 @dataclass(slots=True)
