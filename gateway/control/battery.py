@@ -68,7 +68,8 @@ class Battery:
     _loaded_at: float = float("-inf")
     _other: BatteryLevel | None = None
     _since: float = 0.0
-    """The other level that the readings show, and since when they are on that side of `level`."""
+    """`_other` is the level that the readings show instead of `level`. They have been on its side of `level` since
+    `_since`."""
 
     def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
         """Update the level with a measured voltage. Return True if it has changed. With `loaded`, motors may be on."""
@@ -139,8 +140,8 @@ def rest_v(voltage_v: float, *, loaded: bool) -> tuple[float, float]:
 def charge(voltage_v: float, *, loaded: bool, cells: int = 2) -> tuple[float, float]:
     """Return the charge and its error (half width), 0..1 each.
 
-    The charge is linear between empty and full. Under a load, it is that of the middle of the possible voltages at
-    rest.
+    The charge is linear between empty and full. Under a load, only a range of the voltage at rest is known. The charge
+    is that of the middle of the range.
     """
     low_v, high_v = (each * 2 / cells for each in rest_v(voltage_v, loaded=loaded))
     share = ((low_v + high_v) / 2 - EMPTY_V) / (FULL_V - EMPTY_V)

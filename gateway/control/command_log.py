@@ -25,13 +25,13 @@ class Pending:
     count: int = 1
     """Number of merged commands of a stream."""
     due_at: float = float("-inf")
-    """When its next frame is due, after the delay before it."""
+    """When the next frame is due, at the end of the delay before it."""
     part: Hashable = None
     """The part of the car that it acts on, as its driver names it."""
 
     @property
     def waits_since(self) -> float:
-        """Return since when it waits for the car. If its next frame has a delay, this is in the future."""
+        """Return since when the command waits for the car. During a delay, this is the end of the delay."""
         return max(self.received_at, self.due_at)
 
     @property
@@ -50,7 +50,7 @@ class Pending:
         return any(isinstance(each, Later) for each in self.frames)
 
     def begin_delay(self, now: float) -> None:
-        """Count the delay before its next frame from now on, if it has one."""
+        """Begin the delay before the next frame now, if there is one."""
         self.due_at = now + (self.frames[0].after_s if self.is_delayed else 0.0)
 
 

@@ -1,6 +1,7 @@
 """Holds the commands in progress of one car: the held motion, the pending mode, and the queue of one-shots.
 
-The end of each command is recorded. The driver decides when a frame is written.
+A one-shot is an action on a part of the car. The end of each command is recorded. The driver decides when a frame is
+written.
 """
 
 from collections import deque
@@ -23,9 +24,9 @@ class HeldMotion:
     motion: Motion
     pending: Pending
     expires_at: float
-    """When it ends. While it still waits for the car: when it is given up, unless a stream renews it."""
+    """When the drive ends. Before its frame is written: when the drive is given up, unless a stream renews it."""
     duration_s: float = 0.0
-    """Time from its frame to its end. It is 0 for a stream, because the time of a sample counts from its arrival."""
+    """How long the drive lasts after its frame is written. 0 for a stream: each sample counts from its arrival."""
     began_at: float | None = None
     """When its frame was written, or None if it still waits."""
     range_cm: float | None = None
@@ -38,7 +39,7 @@ class HeldMotion:
 
     @property
     def ends_at(self) -> float:
-        """Return the latest time at which it ends, even if it still waits for the car."""
+        """Return the latest time at which the drive ends, even if it still waits for the car."""
         return self.expires_at + (self.duration_s if self.began_at is None else 0.0)
 
     def begin(self, now: float, range_cm: float | None) -> None:

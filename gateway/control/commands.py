@@ -11,9 +11,9 @@ from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, Speed
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """Hold a motion for `duration_s` seconds from its frame on; in a stream, from the arrival of each sample.
+    """Hold a motion for `duration_s` seconds. `Motion.STOP` ends the motion that is held.
 
-    `Motion.STOP` ends the motion that is held.
+    The time begins when the frame of the motion is written, and in a stream, when a sample arrives.
     """
 
     motion: Motion
@@ -116,7 +116,10 @@ class EmergencyStop:
 
 @dataclass(frozen=True, slots=True)
 class Resume:
-    """End the e-stops with these ids; without ids, the hold; with `all`, both. End only what the sender may end."""
+    """End the e-stops with these ids. Without ids, end the hold. With `all`, end the hold and all e-stops.
+
+    Only what the sender may end is ended.
+    """
 
     ids: tuple[str, ...] = ()
     all: bool = False
@@ -181,7 +184,7 @@ class Command:
     sender: Sender
     what: Action
     age_s: float | None = None
-    """Seconds from sending to arrival. None if the command has no time; then it counts as fresh."""
+    """Seconds from sending to arrival. None if the time of sending is not known. Then the command counts as fresh."""
     ttl_s: float = 2.0
     take: bool = False
     """True if a person wants to take the car from another person."""

@@ -42,12 +42,12 @@ from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason,
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
-"""A drive that waits for the car expires this long after the announced wait, or after its own duration if that is
-longer."""
+"""Margin for a drive that waits for the car. The drive expires this long after the longer of two times: the announced
+wait, and its own duration."""
 
 
 class Controller(Generic[D_co]):
-    """The control of one car. See the docstring of the module for its time.
+    """The control of one car. Times: s of one monotonic clock.
 
     It handles the commands and decides who may command the car. Its `driver` knows the car: what it can do, how it is
     stopped, and what may be claimed about it. The two share the queue of commands and the log.
@@ -93,7 +93,7 @@ class Controller(Generic[D_co]):
 
     @property
     def asked(self) -> Mode | None:
-        """Return the commanded mode, even if it still waits. None if unknown."""
+        """Return the commanded mode, even if the car is not in it yet. None if unknown."""
         pending = self._queue.mode_change
         if pending is not None and isinstance(pending.command.what, SetMode):
             return pending.command.what.mode
@@ -133,7 +133,7 @@ class Controller(Generic[D_co]):
         return self.driver.model.link_open and self.driver.accepts_commands(now)
 
     def wait_s(self, what: Action, now: float) -> float:
-        """Return the longest time until the frame of a drive or a mode could be written, as far as it is known, s."""
+        """Return how long a drive or a mode waits at most before its frame is written, s, as far as that is known."""
         busy_s = self._busy_s(now)
         return self.driver.mode_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
 
@@ -144,7 +144,7 @@ class Controller(Generic[D_co]):
         self.driver.tick(now)
 
     def on_sleep(self, slept_s: float, now: float, *, counted: bool) -> None:
-        """Stop the car after a sleep of the computer, and end the lease. `counted`: `now` includes the sleep."""
+        """Stop the car after a sleep of the computer, and end the lease. With `counted`, `now` includes the sleep."""
         self._slept_at = now
         self.safety.lease = None
         if counted:
@@ -238,7 +238,7 @@ class Controller(Generic[D_co]):
             self.safety.mark_holder(name, connected=alive)
 
     def merge_estops(self, estops: Iterable[Estop], ended: Iterable[str], source: str, now: float) -> None:
-        """Merge the fleet-wide e-stops of which another gateway of the fleet knows: those in force and those ended."""
+        """Merge the fleet-wide e-stops that another gateway reports: those in force, and the ids of ended ones."""
         latched, removed = self.safety.merge(estops, ended)
         for estop in removed:
             words = f"e-stop {estop.id} of {self.car} was ended elsewhere (seen from {source})"
@@ -254,7 +254,7 @@ class Controller(Generic[D_co]):
         self.halt(words, now)
 
     def merge_pauses(self, pauses: Iterable[FleetPause], ended: Iterable[str], source: str, now: float) -> None:
-        """Merge the pauses of which another gateway of the fleet knows: those in force and those ended."""
+        """Merge the pauses that another gateway reports: those in force, and the ids of ended ones."""
         joined, removed = self.safety.merge_pauses(pauses, ended)
         if removed:
             self._log.log(
@@ -318,7 +318,7 @@ class Controller(Generic[D_co]):
         return self._senders.may_drive(command.sender.name, now, streamed=command.streamed, release=release)
 
     def _resume(self, pending: Pending, resume: Resume, now: float) -> Answer:
-        """End e-stops, the hold, or both, as far as the sender may. Answer which of them stay."""
+        """End e-stops, the hold, or both, if the sender may end them. The answer says which of them stay."""
         sender, safety, authority = pending.command.sender, self.safety, self.authority_at(now)
         if not resume.ids and self.driver.model.doubted:  # a person says that the car is fine
             self.driver.end_doubt(now)
@@ -455,7 +455,7 @@ class Controller(Generic[D_co]):
     def _too_busy(self, command: Command, now: float) -> str:
         """Return why a sample of a stream would expire before its frame could be written. Empty if it would not.
 
-        A drive that is no sample of a stream waits instead, and its duration counts from when its frame is written.
+        A drive outside a stream waits instead, and its duration begins when its frame is written.
         """
         what = command.what
         if not command.streamed or not isinstance(what, Drive) or what.motion is Motion.STOP:
@@ -493,7 +493,7 @@ class Controller(Generic[D_co]):
         return self._queued(pending, now, self._wait(pending, now))
 
     def _times(self, pending: Pending, duration_s: float, now: float) -> tuple[float, float]:
-        """Return when a drive expires if its frame is not written, and its duration from that frame on.
+        """Return when a drive expires if its frame is not written, and how long it lasts once the frame is written.
 
         For a sample of a stream, the duration counts from now, and the second value is 0.
         """
@@ -596,7 +596,7 @@ class Controller(Generic[D_co]):
             self.safety.hold = None
 
     def authority_at(self, now: float) -> Authority:
-        """Return the facts that decide now who may do what with the car."""
+        """Return the facts that decide who may do what with the car at this time."""
         safety = self.safety
         return Authority(
             self.people, safety.estops, safety.pauses, safety.hold, safety.loan_at(now), safety.lease_at(now)

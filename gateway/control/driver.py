@@ -4,10 +4,10 @@ A gateway has one driver for its car. The driver turns bytes into events and rea
 refusal. It decides when a frame may be written, how the car is stopped, and what may be claimed about it afterwards.
 Everything else is the task of the gateway: who may command the car, the queue, the records, the link, the bus.
 
-The two meet in three places. `Desk` is what the gateway shares with its driver: the queue of commands and the log.
-`DriverClaims` is what the gateway publishes about the car. `Driver` is what the gateway calls. The loop calls `poll`,
-writes the returned frame, and calls `on_written` or `link_down` before the next `poll`. So there is never more than one
-frame in flight.
+Gateway and driver meet in three places. `Desk` is what the gateway shares with its driver: the queue of commands and
+the log. `DriverClaims` is what the gateway publishes about the car. `Driver` is what the gateway calls. The loop calls
+`poll`, writes the returned frame, and calls `on_written` or `link_down` before the next `poll`. So there is never more
+than one frame in flight.
 
 Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` explains a whole driver step by step.
 """
@@ -174,11 +174,11 @@ class DriverClaims(Protocol):
 
     @property
     def mode(self) -> ModeClaims:
-        """The claims about its mode."""
+        """The claims about the mode of the car."""
 
     @property
     def known(self) -> bool:
-        """True after the first stop of the car, until a write fails. Then the car reads frames as they are meant."""
+        """True if the car reads frames as they are meant: after its first stop, until a write fails."""
 
     @property
     def at_rest(self) -> bool:
@@ -210,7 +210,7 @@ class DriverClaims(Protocol):
 
     @property
     def shows(self) -> Shows:
-        """Whether its reports show that a stop arrived."""
+        """Whether the reports of the car show that a stop arrived."""
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:
@@ -315,7 +315,7 @@ class Driver(ABC):
 
     @abstractmethod
     def drop_bytes(self) -> list[Event]:
-        """Forget the unfinished frame, as the link is lost or bytes were discarded. Return the events of its bytes."""
+        """Forget the unfinished frame, as the link is lost or bytes were discarded. Return the events in its bytes."""
 
     def sends(self, data: bytes, now: float) -> None:
         """Remember the bytes of a frame that is about to be written, if the link or the car may echo them."""
@@ -416,7 +416,7 @@ class Driver(ABC):
         return ""
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return the longest time until the frame of a mode could be written, s. For a motion, it is `busy_s`."""
+        """Return how long a mode waits at most before its frame is written, s. A motion would wait for `busy_s`."""
         del now
         return busy_s
 

@@ -9,7 +9,8 @@ from schemas.words import LinkState
 AIRTIME_WINDOW_S: Final = 10.0
 """Period over which `airtime` is measured."""
 STALE_S: Final = 3.0
-"""Silence after which a link is no longer online if the driver sets no limit, because every silence is normal."""
+"""A link is no longer online after a silence of this length, if its driver sets no limit because every silence is
+normal."""
 
 
 @dataclass(slots=True)

@@ -16,7 +16,7 @@ _OPENED: Final = ""
 
 
 def delay_s(failures: int, jitter: float) -> float:
-    """Return the delay after `failures` (1..) in a row, s. `jitter` 0..1 spreads it over the upper half."""
+    """Return the delay after `failures` (1..) in a row, s: half of the backoff with `jitter` 0, all of it with 1."""
     return backoff_s(failures, FIRST_DELAY_S, MAX_RECONNECT_DELAY_S) * (0.5 + 0.5 * jitter)
 
 

@@ -34,7 +34,7 @@ MAX_AHEAD_S: Final = 5.0
 CLOCK_DOUBT_S: Final = 30.0
 """If a command is later than this, a wrong clock is a more likely cause than a slow network."""
 AFTER_SLEEP_S: Final = 2.0
-"""Time after a sleep of the computer during which a command without `asked` may be from before the sleep."""
+"""For this long after a sleep of the computer, a command without `asked` may be from before the sleep."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class CommandContext:
     link_reason: str
     closing: bool
     asked: Mode | None
-    """The commanded mode, even if it still waits."""
+    """The commanded mode, even if the car is not in it yet."""
     authority: Authority
     ended: tuple[str, ...]
     """Ids of ended e-stops."""
@@ -141,7 +141,7 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
 def _out_of_time(command: Command, context: CommandContext) -> str | None:
     """Return why the command is too old, or too far in the future. None if it is not.
 
-    A command without a time is refused only just after a sleep of the computer.
+    A command without `asked` is refused only just after a sleep of the computer.
     """
     age_s, clocks = command.age_s, f"Set the clock of its computer, or of the one that runs {context.car}'s gateway."
     if age_s is None:
@@ -212,7 +212,7 @@ _DEEDS: Final = {
     Right.LEND: "lend {car}",
     Right.END_LOAN: "end the loan of {car}",
 }
-"""The rights that concern the whole fleet, in words."""
+"""What some rights allow, in the words of a refusal."""
 
 
 def _refusal(denial: Denial, sender: Sender, context: CommandContext, right: Right | None = None) -> Refusal:

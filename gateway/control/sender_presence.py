@@ -63,17 +63,17 @@ class Senders:
         return name not in self._halted
 
     def halt_streams(self, now: float) -> None:
-        """Refuse each stream until it was silent: a joystick held before a loss must not drive the car after it."""
+        """Refuse each stream until it was silent, so that a joystick held before a loss cannot drive afterwards."""
         self._halted.update(
             name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_SILENCE_S
         )
 
     def skip(self, slept_s: float) -> None:
-        """Do not count a sleep of the computer as silence of a stream. Call it if the clock runs on meanwhile."""
+        """Do not count a sleep of the computer as silence of a stream, if the clock runs on during the sleep."""
         self._drives = {name: (last + slept_s, streamed) for name, (last, streamed) in self._drives.items()}
 
     def halt(self, now: float, by: str = "") -> None:
-        """Refuse all senders that have just driven until they were silent, because the car was stopped."""
+        """Refuse each sender that has just driven, until it has been silent, because the car was stopped."""
         # The sender of the stop is exempt, unless it streams: a script may stop and drive again, a held joystick may
         # not.
         self._halted.update(

@@ -14,8 +14,8 @@ gateway continues to stop it.
 
 Three states are kinds of not knowing, and each ends in its own way. `RECOVERING` follows an opened link or a
 contradiction: only a completed stop ends it, since the car may be in any mode with half a frame in its buffer.
-`UNHEARD` is silence: a stop that is merely sent cannot end it, because nothing says that anybody is there; a reading
-does, and then the car is stopped first. `UNKNOWN` is the time without a link, in which neither frames nor readings
+`UNHEARD` is silence: a stop that is merely sent cannot end it, because nothing says that anybody is there. A reading
+ends it, and then the car is stopped first. `UNKNOWN` is the time without a link, in which neither frames nor readings
 count.
 
 Time alone never changes the state. A timeout is an event (`SILENT`, `NOT_SHOWN`), which other modules raise because
