@@ -54,7 +54,7 @@ def check_platform(text: str) -> str:
         else:
             profile_of(name)
     except ValueError as error:
-        raise ValueError(f"{error} Without it, a gateway recognizes {', '.join(AUTO_PLATFORMS)}.") from None
+        raise ValueError(f"{error} Without a platform, a gateway recognizes {', '.join(AUTO_PLATFORMS)}.") from None
     return name
 
 
@@ -110,7 +110,7 @@ def all_profiles() -> tuple[CarProfile, ...]:
 def hint(platform: str, odd: str) -> str:
     """Return the likely cause of something odd in cars of a platform (see `CarProfile.hint`).
 
-    It is empty if the driver of the platform is not installed here. Without a platform, the car is one of `unknown`.
+    It is empty if the driver of the platform is not installed here. An empty platform counts as `unknown`.
     """
     try:
         return profile_of(platform or Platform.UNKNOWN).hint(odd)

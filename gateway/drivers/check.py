@@ -182,7 +182,7 @@ class Bench:
                 break
             if write.why is FrameOrigin.SETUP and setup_due_at > self.now:
                 self.faults.append(
-                    "setup_frame returns a frame earlier than setup_at says: a gateway asks only then, so it would "
+                    "setup_frame returns a frame earlier than setup_at says: a gateway asks at that time, so it would "
                     "write the frame late or never"
                 )
             if not _is(write.data, bytes):

@@ -1,4 +1,4 @@
-"""Splits the bytes of a car that sends lines. Pure. Its work and memory are bounded, whatever bytes arrive."""
+"""Splits the bytes of a car that sends lines. Pure. Work and memory are bounded, whatever bytes arrive."""
 
 from typing import Final
 
@@ -7,7 +7,7 @@ MAX_LINE: Final = 1024
 
 
 class LineSplitter:
-    """Splits the lines of one connection. Make a new one for a new link, which must not complete an old line.
+    """Splits the lines of one connection. A new link needs a new splitter, because it must not complete an old line.
 
     `end` is the bytes that end a line. If it is not a line end but, for example, the `}` of an object, it stays a part
     of the line.

@@ -56,7 +56,8 @@ from schemas.words import (
 )
 
 RENEWAL_S: Final = 6.0
-"""Interval of the repeats of a stop that nothing shows, on a car without a dead-man: as on the first family's cars."""
+"""Interval at which a stop that nothing shows is repeated, if the car has no dead-man timer. The first family has the
+same interval."""
 SPEED_STEP: Final = 0.1
 """One step of the speed, a share of full speed."""
 _STEPS: Final[Mapping[SpeedStep, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}

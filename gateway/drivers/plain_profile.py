@@ -1,4 +1,4 @@
-"""The profile of cars of a plain family, in a module of its own: the driver loads slowly. Pure."""
+"""The profile of cars of a plain family. It has a module of its own, because the driver loads slowly. Pure."""
 
 from dataclasses import dataclass
 
@@ -21,13 +21,13 @@ class PlainProfile:
     baud: int = 115200
     """Rate of its serial port."""
     dead_man_s: float | None = None
-    """Time after which the car stops because no *motion* arrived. With such a time, stops that no reading shows are not
-    repeated. None if there is no such time. A car that only watches its link (a heartbeat, a closed connection) has
-    none, because it drives on while the link is alive."""
+    """Time after which the car stops because no *motion* arrived, or None if there is no such time. A car with such a
+    time gets no repeats of a stop that no reading shows. A car that only watches its link (a heartbeat, a closed
+    connection) has none, because it drives on while the link is alive."""
     not_observed: tuple[str, ...] = ()
     """Facts that were read or assumed, but not seen on a car, as sentences."""
     has_network: bool = True
-    """True if a TCP port is the car's own. False if it belongs to a bridge, so that `fleet check` may connect to it."""
+    """True if a TCP port is the car's own. False if it belongs to a bridge. Then `fleet check` may connect to it."""
     hints: tuple[tuple[str, str], ...] = ()
     """The likely cause of a finding of `fleet doctor` (`silent`, `not_obeyed`) in such cars, as a sentence for each."""
     modes: frozenset[Mode] = frozenset({Mode.MANUAL})

@@ -99,7 +99,7 @@ UNASKED_LOG_S: Final = 30.0
 ON_ITS_WAY_S: Final = 2.0
 """Maximum time that a line of ours takes to reach the car over a slow link."""
 STUCK_S: Final = 1.0
-"""Maximum time for which a wheel may stand still in a drive: twice the speed loop's way to full power."""
+"""Maximum time for which a wheel may stand still in a drive: twice the time that the speed loop takes to full power."""
 VOLTAGE_S: Final = 1.0
 """Interval at which an unchanged voltage is published. Feedbacks repeat the last measured voltage for up to 10 s."""
 ECHO_S: Final = 2.0

@@ -166,7 +166,8 @@ class CarMonitor:
         model = self.model
         if model.platform.profile is model.profile or not model.link_open:
             return
-        # With a wrong head, the car ignores our named frames, and its readings cannot be read. So do not postpone that.
+        # With a wrong head, the car ignores our named frames, and its readings cannot be read. So do not postpone a
+        # change of the head.
         has_other_head = model.platform.profile.dialect.head != model.profile.dialect.head
         may_replace = has_other_head or (model.platform.open_mode and model.stop_style is StopStyle.BOTH)
         if not may_replace and not self._executor.accepts_commands(now):

@@ -157,7 +157,7 @@ class YahboomDriver(Executor):
                 return None
 
     def _too_fast(self, step: SpeedStep) -> str | None:
-        """Return why the car must not become as fast as this step would make it, or None if it may."""
+        """Return why this step would make the car too fast, or None if it would not."""
         speed, before = self.model.profile.speed, self.model.believed.speed
         after = speed.step(before, step)
         share, maximum = speed.fraction(after), self.desk.speed_max

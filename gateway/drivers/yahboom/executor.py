@@ -29,8 +29,8 @@ FREE_ACTIONS: Final = 3
 """Number of actions on parts of the car that are written at once. In a stream of more, the next ones may have to
 wait."""
 LISTEN_LIMITS: Final = 2.0
-"""Time without a report after which a stream of actions waits for one. The unit is the silence that contradicts the
-mode."""
+"""After a time without a report, a stream of actions waits for one. That time is this many times the silence that
+contradicts the mode."""
 NOTICE_S: Final = 2 * TICK_S
 """Maximum time within which a silence is noticed: the ticks of a busy gateway come late."""
 NO_REPEAT_S: Final = 2 * FLIGHT_S
@@ -175,7 +175,7 @@ class Executor(Driver):
         """Open a mode, but stop the car first, because a mode that is opened during a drive leaves the motors on."""
         assert isinstance(pending.command.what, SetMode)
         model = self.model
-        # If a full stop is running here, it gives way, so its frames are written. Do not wait for its evidence.
+        # A full stop that is still running here has sent its frames, and gives way. Do not wait for its evidence.
         if not (model.rest_is_sure or self._full_stop_runs):
             return self._begin_stop(self.stops.full(now), FrameOrigin.STOP, now, pending)
         if now < model.pacing.open_at(now, can_show=model.can_show):
@@ -184,7 +184,7 @@ class Executor(Driver):
         return self._prepare(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return the longest time until the frame of a mode could be written, s. For a motion, it is `busy_s`."""
+        """Return how long a mode waits at most before its frame is written, s. A motion would wait for `busy_s`."""
         model = self.model
         if model.rest_is_sure and self.stops.running is None:
             return max(busy_s, model.pacing.open_at(now, can_show=model.can_show) - now)
@@ -248,7 +248,7 @@ class Executor(Driver):
 
         The stream waits for the repeats. Otherwise a color every 0.3 s would put off the repeats of a lost stop for
         ever, and the car would drive on. It also waits for evidence, because each action changes the times of the
-        reports that would show the stop. But if a mode waits behind the actions, they wait only as long as the next
+        reports that would show the stop. But if a mode waits behind the actions, they wait only while the next
         report may complete the evidence.
         """
         running = self.stops.running

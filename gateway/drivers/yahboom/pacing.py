@@ -158,7 +158,7 @@ class Pacing:
         return self._read_by + self._block_s
 
     def is_blocked(self, now: float) -> bool:
-        """Return True if the car is certainly acting on our last frame, and not still ranging before it reads it."""
+        """Return True if the car is certainly acting on our last frame, not still ranging with the frame unread."""
         running = self._sure_block_s > FLIGHT_S and now < self._written_at + self._sure_block_s
         return running and self._earlier_block_s == 0.0 and self.is_clear(now)
 
@@ -179,7 +179,7 @@ class Pacing:
                 return self.buffer_until
 
     def act_at(self, frame: Frame, *, alone: bool = False) -> float:
-        """Return the earliest time for the frame of a one-shot, or the earliest at which the car reads it alone."""
+        """Return the earliest time for the frame of a one-shot. With `alone`, the car must read the frame alone."""
         if self.profile.kind is Platform.RASPBERRY_PI and not isinstance(frame, General):
             alone = True  # if it is received with another one, the program dies
         at = max(self.flight_until, self.earliest_named_at(frame))

@@ -23,7 +23,7 @@ from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
 _PROBED: Final = (Finding.REPORT, Finding.BLOCK_GAP, Finding.CONTROL)
-"""Findings after which a stop that the car may still show continues with its next frame, a probe or a control."""
+"""After one of these findings, the gateway sends a probe or a control, if the car may still show the stop."""
 
 
 class StopExecutor:
@@ -63,7 +63,7 @@ class StopExecutor:
             running.repeats = False
         if why is FrameOrigin.SHUTDOWN:
             running.why = why
-        # A new command need not wait for the next try. But only after this silence the car reads the next frame alone.
+        # A new command need not wait for the next try. But the car reads the next frame alone only after this silence.
         if pending is not None and running.frames_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
@@ -156,7 +156,7 @@ class StopExecutor:
         return self.shutting_down and self.running is None
 
     def is_shutdown_over(self, now: float) -> bool:
-        """Return True if the time is over for which a gateway that shuts down waits for evidence of the stop."""
+        """Return True if a gateway that shuts down has waited long enough for evidence of the stop."""
         return self.shutting_down and now >= self._shutdown_until
 
     def give_up(self, running: StopInProgress, now: float) -> None:
@@ -360,7 +360,7 @@ class StopExecutor:
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once, because the reports have continued without a block gap.
 
-        The case decides, because the reports of a Raspberry Pi always continue.
+        The case decides whether to do so, because the reports of a Raspberry Pi always continue.
         """
         running.probes += 1
         if (
@@ -371,7 +371,8 @@ class StopExecutor:
             self._try_again(running, now)
             if running.sequence.is_recovery:
                 # The car may report by a timer although frames block it. Then the block of the last frame may not be
-                # over. The car would read a `#` that arrives before its end as one string with the `MODE00` after it.
+                # over. If a `#` arrived before the end of the block, the car would read it and the `MODE00` after it as
+                # one string.
                 running.try_at = max(now, self.model.pacing.flight_until + FLIGHT_S)
 
     def _finish(

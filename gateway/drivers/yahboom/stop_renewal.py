@@ -1,4 +1,7 @@
-"""Repeats the stop of a car that counts as stopped but has not shown it: its frames may have been lost. Pure."""
+"""Repeats the stop of a car that counts as stopped but has not shown it: its frames may have been lost. Pure.
+
+Each repeat is called a renewal.
+"""
 
 from typing import Final
 

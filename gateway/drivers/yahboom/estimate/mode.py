@@ -32,7 +32,7 @@ MAX_FADE_EXCUSE_S: Final = SERVO_S
 """Maximum time by which blocks of our frames prolong a confirmation: that of a servo. A stream of actions must not keep
 a claim alive that no reading supports any more."""
 MAX_BLOCKS: Final = 256
-"""Maximum number of blocking frames that are remembered to excuse a silence, such as that of endless whistling."""
+"""Maximum number of blocking frames that are remembered to excuse a silence, as during endless whistling."""
 
 
 @dataclass(slots=True)
@@ -172,7 +172,7 @@ class ModeEstimator:
             self._conclude(Verdict.CONTRADICTED, words, now)
 
     def allow_silence(self, silent_s: float) -> None:
-        """Count a silence that a report has ended as normal for this car on this link.
+        """Treat a silence as normal for this car on this link, because a report has ended it.
 
         Ignore a silence of over `FIRST_SILENCE_S`, because then the car was off or out of range.
         """

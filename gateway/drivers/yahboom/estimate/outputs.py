@@ -59,7 +59,7 @@ class StateEstimate:
 
     @property
     def fan_may_run(self) -> bool:
-        """Return True if the fan runs, or may run because its state is unknown and it was toggled since a reading."""
+        """Return True if the fan runs, or may run: its state is unknown, and it was toggled since the last reading."""
         return self.fan is True or (self.fan is None and self.fan_toggled)
 
     def with_motion(self, frame: Frame) -> Frame:

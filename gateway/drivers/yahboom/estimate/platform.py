@@ -125,7 +125,7 @@ class PlatformDetector:
 
     @property
     def is_settled(self) -> bool:
-        """Return True if the platform is known, or enough readings have arrived that more would not show it."""
+        """Return True if the platform is known, or if so many readings have arrived that more would not show it."""
         return self.profile.kind is not Platform.UNKNOWN or self._readings > EVIDENCE_FRAMES
 
     def begin_link(self) -> None:
@@ -251,8 +251,8 @@ class PlatformDetector:
             self._options = _without_head(self._options) | {option}
             self._apply_evidence()
             return ()
-        # Only cars with this head send such frames, so the configured head is wrong. With that one, no reading could be
-        # decoded.
+        # Only cars with this head send such frames, so the configured head is wrong. With the configured one, no
+        # reading could be decoded.
         named = self.profile.name
         self.profile = _profile_of(self.profile.kind, _without_head(self.profile.options) | {option})
         words = f"readings that begin with {head}, which {named} cars do not send. It is treated as {self.profile.name}"
@@ -264,8 +264,8 @@ class PlatformDetector:
         if len(candidate_modes(event)) > 1:
             return
         in_manual = only_candidate(event) is Mode.MANUAL
-        # Whole centimeters without these constants may come from a Raspberry Pi that measures its battery, or from an
-        # stm32. A mode frame would end the Raspberry Pi's program, so such a car stays unknown.
+        # Whole centimeters without the constants of a Raspberry Pi may come from a Raspberry Pi that measures its
+        # battery, or from an stm32. A mode frame would end the Raspberry Pi's program, so such a car stays unknown.
         whole = whole_cm(event)
         shown = {
             _MODE_READINGS: not in_manual,

@@ -25,7 +25,7 @@ class EncodeError(ValueError):
 class Dialect:
     """The spelling of the frames of one program.
 
-    `head` is the first word of named frames and readings. `swaps_green_and_blue`: place 7 has 3 for blue and 4 for
+    `head` is the first word of named frames and readings. With `swaps_green_and_blue`, place 7 has 3 for blue and 4 for
     green (docs/reference/protocol.md#programs-that-people-have).
     """
 

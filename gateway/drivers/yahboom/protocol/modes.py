@@ -18,8 +18,8 @@ class ModeRow:
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the
     longest block of one turn of the mode's own loop. `rate_hz` is the maximum number of sensors frames per second.
-    `measures` lists the measurements in a frame of this mode, even if the vendor's program does not print it, but
-    others do.
+    `measures` lists the measurements in a frame of this mode, even if only other programs than the vendor's print such
+    a frame.
     """
 
     digit: int
@@ -95,6 +95,6 @@ def _candidates(raw: bytes, terminated: bool, by_silence: bool) -> tuple[Mode, .
     if len(found) > 1 and not by_silence:
         found = [(mode, row) for mode, row in found if row.has_end is terminated]
     modes = tuple(mode for mode, _ in found)
-    # If there is a `#` although this mode sends none, either the `#` is foreign, or it is a frame of mode 0 that
-    # happens to have the same text.
+    # If there is a `#` although this mode sends none, either the `#` is foreign, or the frame is one of mode 0
+    # that happens to have the same text.
     return (Mode.MANUAL, *modes) if terminated and not any(row.has_end for _, row in found) else modes

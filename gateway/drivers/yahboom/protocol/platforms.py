@@ -125,7 +125,7 @@ def _common_measurements(modes: tuple[Mode, ...], shown: tuple[Mode, ...]) -> fr
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One kind of car: a column of docs/reference/protocol.md#platforms's table of platforms."""
+    """One kind of car: a column of the table in docs/reference/protocol.md#platforms."""
 
     kind: Platform
     options: frozenset[str]
@@ -302,8 +302,8 @@ class Profile:
     def modes_of_frame(self, event: Sensors, mode: Mode | None = None) -> tuple[Mode, ...]:
         """Return the modes in which the car may have sent this frame.
 
-        If the confirmed `mode` is among the candidates, return only that. If not, the frame may be a corrupted frame of
-        that mode, until three frames in a row contradict it, so add it.
+        If the confirmed `mode` is among the candidates, return only that. If not, return it, too: until three frames
+        in a row contradict the mode, the frame may be a corrupted one of that mode.
         """
         candidates = candidate_modes(event)
         if mode is None:

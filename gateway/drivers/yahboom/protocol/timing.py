@@ -46,5 +46,5 @@ def block_s(frame: Frame, *, fan_s: float = 0.0) -> float:
             return MODES[mode].open_s
         case ModeClose():
             return MODE_CLOSE_S
-        case Reset():  # the table has no row for a lone `#`: as the stop that it acts as
+        case Reset():  # the table has no row for a lone `#`: assumed as a stop, because it acts as one
             return FRAME_S

@@ -277,7 +277,7 @@ class StopEvidence:
             self._closed_alone = False
 
     def on_block(self, kind: Blocking | None, block_s: float, now: float) -> None:
-        """Record a frame other than `MODE00`, if it blocks the car, `block_s` at most, and so delays a report."""
+        """Record a frame other than `MODE00`, which may block the car for `block_s` and so delay a report."""
         if block_s > FRAME_S:
             self._blocks.append(_Block(kind, block_s, now))
 

@@ -18,7 +18,7 @@ JUDGED_S: Final = 2.3
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame of a sequence. `after_s` is the minimum time after the previous frame, or after the try's begin."""
+    """One frame of a sequence. `after_s` is the minimum time after the frame before it, or after the try began."""
 
     frame: Frame
     gate: Gate = Gate.NOTHING
@@ -123,7 +123,7 @@ CONTROL_SHARE: Final = 0.35
 
 
 def control(interval_s: float) -> StopSequence:
-    """Return the test whether writing makes the link lose a report. It is a frame that does not block the car.
+    """Return the test that shows whether writing makes the link lose a report: a frame that does not block the car.
 
     It is sent later after a report than the `MODE00` before it. So if writing `MODE00` made the link mute for long
     enough to hide the next report, writing this frame hides the next one too, however much the intervals differ.

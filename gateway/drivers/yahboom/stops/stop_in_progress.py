@@ -1,4 +1,7 @@
-"""Chooses the stop for a context, computes its worst case, and tracks a stop in progress. Its frames: sequences.py."""
+"""Chooses the stop for a context, computes its worst case, and tracks a stop in progress.
+
+`sequences` has the frames.
+"""
 
 from dataclasses import dataclass, field
 from typing import Final
@@ -62,9 +65,9 @@ def evidence_s(profile: Profile, learned: Learned) -> float:
 
 
 def report_wait_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
-    """Return the time after the last frame of a try within which a car that has obeyed it reports, s.
+    """Return the longest time from the last frame of a try to the next report of a car that has obeyed, s.
 
-    With `slowest`, its rhythm is not known, so assume the slowest car.
+    With `slowest`, the rhythm of the car is not known, so assume the slowest car.
     """
     # If there is no echo, the car ranges before it reads the frame, is blocked, and ranges again before it reports.
     interval_s = learned.interval_s(SLOWEST_S if slowest else profile.interval_s)
@@ -104,7 +107,10 @@ class StopContext:
 
     @property
     def turn_s(self) -> float:
-        """Return the longest turn of the mode's loop, which reads nothing meanwhile, or that of the slowest mode."""
+        """Return the longest turn of the mode's loop, during which the car reads nothing, s.
+
+        If the mode is not known, it is that of the slowest mode.
+        """
         known = self.mode is not None and not self.contradicted
         return self.profile.mode_turn_s(self.mode if known and self.mode is not None else Mode.OBSTACLE_AVOIDANCE)
 
