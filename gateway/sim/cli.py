@@ -83,7 +83,7 @@ A world from a file can have lamps that light sensors see, things to bump into a
 other and block each other's way. `fleet example copy follow` writes such a file with a comment for each field. On
 stdin:
   {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (for a lamp on a car: ahead, left)
-  {"thing": "cart", "x_m": 1, "y_m": 0} takes it off its path, to there; or "speed_m_s": its speed along its path
+  {"thing": "cart", "x_m": 1, "y_m": 0} puts it there, off its path; or "speed_m_s": its speed along its path
 The true state, on stdin:
   {"car": "red", "ask": "truth"}        mode, motors, pose, ...; for a replay: bytes sent and ignored, rounds
   {"ask": "world"}                      every lamp and thing: where it is, whether it is on, its size and speed

@@ -35,10 +35,10 @@ class Owner(Protocol):
         """Accept bytes from the host."""
 
     def connected(self) -> None:
-        """Note that a host has connected (TCP only)."""
+        """Record that a host has connected (TCP only)."""
 
     def disconnected(self) -> None:
-        """Note that the host has disconnected (TCP only)."""
+        """Record that the host has disconnected (TCP only)."""
 
 
 class SimEndpoint(Protocol):
@@ -299,7 +299,7 @@ class TcpEndpoint(SimEndpoint):
         self._owner.received(data)
 
     def on_host_gone(self, transport: asyncio.Transport) -> None:
-        """Note the end of a connection, unless this link has cut it itself."""
+        """Record the end of a connection, unless this link has cut it itself."""
         if transport is self._transport:
             self._transport = None
             self._owner.disconnected()

@@ -45,7 +45,7 @@ class Fault:
     kind: FaultKind
     car: str | None = None
     for_s: float | None = None
-    """Duration in seconds. 0 ends the fault now. None means until a fault of the same kind with 0 ends it.
+    """Duration in seconds. 0 ends the fault now. With None, it lasts until a fault of the same kind with 0 ends it.
 
     `link_drop` with 0 ends every loss of the link. For `empty`: the time until the battery is empty.
     """

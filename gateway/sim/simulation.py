@@ -141,7 +141,7 @@ class SimCar:
         self._pump()
 
     def connected(self) -> None:
-        """Note that a TCP host has connected."""
+        """Tell the program that a TCP host has connected."""
         if isinstance(self.firmware, RaspberryPiCar):
             self.firmware.connected(self._loop.time())
         elif isinstance(self.firmware, CaptureCar):
@@ -149,7 +149,7 @@ class SimCar:
             self._pump()
 
     def disconnected(self) -> None:
-        """Note that a TCP host has disconnected."""
+        """Tell the program that a TCP host has disconnected."""
         if isinstance(self.firmware, RaspberryPiCar):
             self.firmware.disconnected(self._loop.time())
             self._pump()

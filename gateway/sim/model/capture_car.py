@@ -9,7 +9,10 @@ LOOP_PAUSE_S: Final = 1.0
 
 
 class CaptureCar:
-    """Plays (time in the capture s, bytes) once or for ever, `rate` times as fast. Times must not run backwards."""
+    """Plays pieces (time in the capture, s, and bytes), `rate` times as fast, once or for ever.
+
+    Times must not run backwards.
+    """
 
     def __init__(
         self, pieces: Sequence[tuple[float, bytes]], *, rate: float = 1.0, loop: bool = False, now: float | None = None

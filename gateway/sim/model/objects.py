@@ -64,7 +64,7 @@ class MovingObject:
     depth_m: float = 0.0
     heading_rad: float = 0.0
     path: tuple[Point, ...] = ()
-    """A closed polyline on which the thing moves instead of x and y. A path there and back includes both ways."""
+    """A closed polyline on which the thing moves. It replaces x and y. A path there and back includes both ways."""
     speed_m_s: float = 0.0
     carried_by: str = ""
     """Name of the car that carries the thing. Then x (ahead) and y (left) are in the frame of this car."""

@@ -92,12 +92,12 @@ class RaspberryPiCar(Firmware):
                 self._due[option] = offset
 
     def connected(self, now: float) -> None:
-        """Note that a TCP client has connected."""
+        """Record that a TCP client has connected."""
         self._run(now)
         self._client = True
 
     def disconnected(self, now: float) -> None:
-        """Note that the TCP client is gone. The next report then ends the program, even if a client has reconnected."""
+        """Record that the TCP client is gone. The next report ends the program, even if a client has reconnected."""
         self._run(now)
         self._client_gone = True
 

@@ -48,7 +48,7 @@ PAGE_OPEN_S: Final = 10.0
 """Time from the last press until the page is closed and its queries end."""
 KP: Final = 20.0
 KI_PER_TURN: Final = 200.0
-"""Integral gain per step of the speed loop, which is one in SPEED_LOOP_S."""
+"""Integral gain per step of the speed loop. A step takes SPEED_LOOP_S."""
 DEAD_DUTY: Final = 23.0
 """A smaller duty counts as zero."""
 _ROM: Final = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805e4\r\n"
@@ -360,7 +360,7 @@ class UgvCar:
             self._duty[side] = duty if abs(duty) >= DEAD_DUTY else 0.0
 
     def _measured(self, side: int) -> float:
-        """Return the speed that the encoder of a side measures. Without it, this is 0, and a closed loop winds up."""
+        """Return the speed that the encoder of a side measures. Without one, it is 0, and a closed loop winds up."""
         if not self._build.has_encoders or ("no_encoder" in self._options and side == 0):
             return 0.0
         return self._sign * round(self._wheels[side], 3)
