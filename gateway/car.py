@@ -86,7 +86,7 @@ class Settings:
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
     holds_of: str = ""
-    """The car to which the holds and loans belong. Empty: the car at this link."""
+    """The car that the saved holds and loans belong to. If this is empty, they belong to the car at the link."""
 
 
 class CarGateway:
@@ -360,7 +360,7 @@ class CarGateway:
                 self._worst_lag_s = 0.0
 
     def _on_gap(self, now: float) -> None:
-        """Handle a gap of the loop or a sleep: the bus may be lost meanwhile, and a driven car must be stopped."""
+        """Handle a gap of the loop or a sleep: the bus may have been lost, and a driven car must be stopped."""
         if (slept_s := self._sleep.take()) > 0:
             self._publisher.on_bus_lost(now)
             if not MONOTONIC_COUNTS_SLEEP:
@@ -431,7 +431,7 @@ async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> boo
     except (AlreadyServed, LinkError):
         raise
     except Exception:  # a driver may come from another package, and must not leave a moving car alone
-        log.exception("the gateway of %s failed; a newly started driver program now stops its car", settings.car)
+        log.exception("the gateway of %s failed; a new driver is started now to stop its car", settings.car)
         where = (settings.car, settings.url, settings.platform, settings.fleet, settings.state_dir)
         log.error("%s", await stop_alone(*where))
         return False

@@ -18,7 +18,7 @@ MAX_BYTES: Final = 65536
 
 
 class LearnedFile:
-    """The file of one car. `link` is the text of `schemas.links.car_link`; `platform`: as configured."""
+    """The file of one car. `link` is the text of `schemas.links.car_link`, `platform` the configured one."""
 
     def __init__(self, directory: Path, fleet: str, car: str, *, link: str, platform: str) -> None:
         self.path = directory / f"{fleet}.{car}.learned.json"

@@ -165,7 +165,7 @@ class LinkLoop:
                 self._on_flood("raw_not_published", 1, event.at)
             self._driver.on_event(event, self._loop.time())
             if isinstance(event, TextLine):
-                self.health.on_rejected(FrameVerdict.TEXT)  # text shows that some program runs, but no car's program
+                self.health.on_rejected(FrameVerdict.TEXT)  # text shows that a program runs, but not that it is a car's
                 continue
             self.health.rx_frames += 1
             if isinstance(event, Rejected):
@@ -179,7 +179,7 @@ class LinkLoop:
                 self._log_open()
 
     def lost(self, reason: str) -> None:
-        """Note that the link is down, and fail the commands that wait for it."""
+        """Record that the link is down, and fail the commands that wait for it."""
         now = self._loop.time()
         self.link = None
         self.health.on_lost(reason, now)

@@ -33,7 +33,7 @@ class LinkChecks:
     def take(self, before: tuple[str, ...], after: tuple[str, ...], *, found: bool | None) -> bool:
         """Take the hubs before and after one look, and what it has found. Return True if the certificate is revoked.
 
-        found: as `passes_on` returns it.
+        `found` is the result of `passes_on`.
         """
         if found is not False or before != after:
             self._silences = 0

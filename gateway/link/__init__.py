@@ -5,7 +5,8 @@
 finds the port of a USB device, `serial_ports` and `ble_devices` list ports and devices, `url` parses a link of the
 command line. `baud` finds out whether the baud rate may be wrong.
 
-A kind of link is a class of URLs in `schemas.links`, and a module with a `KIND` here that is named like its scheme.
+Each kind of link has a class of URLs in `schemas.links`, and here a module that is named like the scheme and has a
+`KIND`.
 """
 
 from importlib import import_module

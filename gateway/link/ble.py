@@ -416,7 +416,7 @@ def _scanner(
 
 
 async def _within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
-    """Return the result of the work. After `seconds`, cancel it until it ends, and raise TimeoutError."""
+    """Return the result of the work. After `seconds`, cancel it repeatedly until it ends, and raise TimeoutError."""
     task = asyncio.ensure_future(work)
     try:
         await asyncio.wait({task}, timeout=seconds)

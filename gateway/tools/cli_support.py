@@ -66,7 +66,7 @@ def duration(option: str, text: str, min_s: float, max_s: float) -> float:
 
 
 def profile_of(text: str) -> Profile:
-    """Return the profile that `--platform` names. Raises WrongUse if it is none whose frames these commands know."""
+    """Return the profile that `--platform` names. Raises WrongUse if these commands do not know its frames."""
     try:
         return parse_platform(text)
     except ValueError as error:

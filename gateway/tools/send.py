@@ -189,7 +189,7 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
         case Ptz() | ColorLed() | ArmSet():
             lines.append("its motors do not change; in a mode other than 0 it ignores this")
         case Reset():
-            lines.append("this ended half a frame in its buffer, which the car may have obeyed")
+            lines.append("this ended half a frame in the car's buffer, and the car may have obeyed that half")
         case None:
             lines.append(
                 "this frame is not in the table: its effect is unknown. The car may drive, or ignore the next frames"
