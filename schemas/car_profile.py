@@ -70,7 +70,7 @@ class CarProfile(Protocol):
         """Return a sentence on why the car lacks a capability. None if the car, or every car, has the capability."""
 
     def hint(self, odd: str) -> str:
-        """Return the likely cause of something odd in such cars, as a sentence. Empty if there is none of their own.
+        """Return the likely cause of something odd in such cars, as a sentence. Empty if the platform has none.
 
-        odd: a finding of `fleet doctor` (`silent`, `not_obeyed`), or a field whose values are always out of range.
+        `odd` is a finding of `fleet doctor` (`silent`, `not_obeyed`), or a field whose values are always out of range.
         """

@@ -121,4 +121,4 @@ _ROWS: Final = (
 COMMANDS: Final[Mapping[str, CommandType]] = MappingProxyType({row.verb: row for row in _ROWS})
 STOPS: Final = tuple(row.verb for row in _ROWS if row.stops)
 STOPPING_VERBS: Final = frozenset({*STOPS, Verb.PAUSE})
-"""Verbs that stop a car, whether or not somebody must end that afterwards."""
+"""Verbs that stop a car. After some of them, somebody must end the stop before the car may be driven again."""

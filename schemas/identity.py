@@ -127,7 +127,7 @@ def may_locate(identity: str, of: str) -> bool:
 
 
 def sender_for(identity: str, sender: str, verb: str) -> str:
-    """Return the sender of a person's command to a service: its name in the command, else the certificate's owner.
+    """Return the sender of a person's command to a service: the name in the command, else the certificate's owner.
 
     `identity` is empty on a hub without certificates, where every name is believed. Raises NotTheSender.
     """

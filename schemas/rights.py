@@ -20,7 +20,7 @@ _STRENGTH: Final = {rank: -number for number, rank in enumerate(Rank)}
 
 
 def strength(rank: Rank) -> int:
-    """Return a number that is higher for a rank that outranks another."""
+    """Return the strength of a rank as a number. A rank has a higher number than the ranks that it outranks."""
     return _STRENGTH[rank]
 
 
@@ -168,7 +168,7 @@ def _parse(entry: str) -> tuple[str, PersonRole]:
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Keeps the coordinator from moving a stopped car. The hold of a lead also keeps persons and scripts from it.
+    """Keeps the coordinator from moving a stopped car. The hold of a lead also keeps persons and scripts from doing so.
 
     `since_ns` is in ns since the epoch.
     """
@@ -245,7 +245,7 @@ Mark = Hold | Estop | FleetPause | Loan | LeaseState
 def binding_pause(pauses: Iterable[Any]) -> Any:
     """Return the pause that binds: the newest of the highest rank. Returns None if there is no pause.
 
-    pauses: FleetPause, or those of a fleet.v1.Safety; oldest first.
+    `pauses` are FleetPauses, or the pauses of a fleet.v1.Safety, the oldest first.
     """
     return max(reversed(list(pauses)), key=lambda pause: strength(rank_of(pause.rank)), default=None)
 
@@ -322,7 +322,7 @@ class Denial:
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """The rules and facts that decide about rights on one car now. e-stops and pauses: oldest first."""
+    """The rules and facts that decide about rights on one car now. E-stops and pauses are listed oldest first."""
 
     people: People = NO_PEOPLE
     estops: tuple[Estop, ...] = ()

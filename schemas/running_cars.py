@@ -13,13 +13,16 @@ _SUFFIX: Final = ".running"
 
 
 class RunningMark:
-    """The mark of one gateway: a lock that ends with its process, even if killed. `directory`: the state of its bus."""
+    """The mark of one gateway: a lock that ends with its process, even if that is killed.
+
+    `directory` is the state directory of its bus.
+    """
 
     def __init__(self, directory: Path, fleet: str, car: str) -> None:
         self._lock = FileLock(directory / f"{fleet}.{car}{_SUFFIX}")
 
     def renew(self) -> None:
-        """Set the mark if it is not set. Call it regularly: a program that looks for marks locks all for a moment."""
+        """Set the mark if it is not set. Call this regularly: a program that looks for marks takes each one briefly."""
         with suppress(OSError):  # a full disk, or a place without locks: the gateway runs all the same
             self._lock.try_take()
 
@@ -29,12 +32,12 @@ class RunningMark:
 
 
 def running_cars(endpoint: str) -> list[str]:
-    """Return the cars with a gateway of this user and bus on this computer: `red`, or `two/red` of fleet two."""
+    """Return the cars whose gateways this user runs on this computer and bus: `red`, or `two/red` of fleet two."""
     return [car if fleet == DEFAULT_FLEET else f"{fleet}/{car}" for fleet, car in _running(endpoint)]
 
 
 def running_cars_of(endpoint: str, fleet: str) -> set[str]:
-    """Return the cars of one fleet with a gateway of this user and bus on this computer."""
+    """Return the cars of one fleet whose gateways this user runs on this computer and bus."""
     return {car for of, car in _running(endpoint) if of == fleet}
 
 

@@ -1,4 +1,4 @@
-"""Checks a world file (YAML 1.2): each field alone, then shapes, places and carriers, which several fields make. Pure.
+"""Checks a world file (YAML 1.2): each field alone, then how the fields fit together. Pure.
 
 Distances in meters, speeds in m/s, angles in degrees counter-clockwise from x. `world_fields` has the fields. The
 simulator builds a world from a file that passes. `fleet check` only reports whether it passes.

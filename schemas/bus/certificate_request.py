@@ -34,8 +34,8 @@ def identity_in(path: Path) -> str:
 def renew(credentials: Credentials, identity: str, file: str, now: datetime, ask: Callable[[bytes], bytes]) -> str:
     """Fetch and store the next certificate of an identity. Return why that failed, or an empty text if it is stored.
 
-    file: name of the files of the certificate and its key, without their ending. `ask` sends a request to the hub, and
-    returns the answer, or nothing if there is none.
+    `file` is the name of the files of the certificate and its key, without their ending. `ask` sends a request to the
+    hub, and returns the answer, or nothing if there is none.
     """
     path = credentials.directory / f"{file}.pem"
     try:

@@ -152,7 +152,7 @@ class Latest(Generic[T]):
         loop.call_soon(self._hand_over)
 
     def __call__(self, name: str, value: T) -> bool:
-        """Note a change, on a Zenoh thread. Return False if it was dropped."""
+        """Record a change, on a Zenoh thread. Return False if it was dropped."""
         with self._lock:
             first = not self._changed
             if len(self._changed) >= self._limit and name not in self._changed:

@@ -380,7 +380,7 @@ class Bus:
         return token
 
     def tokens(self, expression: str, timeout_s: float = 5.0) -> list[str]:
-        """Return the existing tokens. Nothing is raised after a timeout: tokens that came later are missing then.
+        """Return the existing tokens. After a timeout, return those that have come by then.
 
         A link that was lost is awaited for up to 2 s, unless the session watches this expression.
         """

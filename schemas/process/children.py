@@ -16,7 +16,7 @@ OWN_GROUP: Final = 0 if os.name == "posix" else None
 def start_detached(command: Sequence[str], *, output: int | IO[Any] = subprocess.DEVNULL) -> "subprocess.Popen[str]":
     """Start a process that outlives this one and its terminal. Call `leave` before this one ends.
 
-    output: where its stdout and stderr go.
+    `output` is where its stdout and stderr go.
     """
     return subprocess.Popen(
         command,
