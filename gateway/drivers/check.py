@@ -333,7 +333,7 @@ def _faults_of_values(topic: str, fields: Mapping[str, Any]) -> Iterator[str]:
 
 
 def check_connect(family: Family, platform: str) -> Iterator[str]:
-    """Check that a car is stopped when its link opens, and that nothing is claimed that it has not shown."""
+    """Check that a car is stopped when its link opens, and that a silent car never counts as having shown a stop."""
     bench = _connected(family, platform)
     if not bench.stop_frames():
         yield "no stop was written within 30 s after the link was opened: the car may drive"
@@ -423,7 +423,7 @@ def check_hostile(family: Family, platform: str) -> Iterator[str]:
 
 
 def check_rest(family: Family, platform: str) -> Iterator[str]:
-    """Check that a car which moves never counts as one that has shown its stop.
+    """Check that a moving car never counts as having shown its stop.
 
     `MOVING` of the module has bytes of a car that moves. If `SAMPLES` show a stop, `MOVING` is required, because
     perhaps any report of the car would count as one that shows a stop.

@@ -146,7 +146,7 @@ class PlainModel:
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:
-        """Whether its readings show that a stop arrived, with the reason."""
+        """Whether the readings of the car show that a stop arrived, with the reason."""
         return self.shows, self.shows_words
 
     def unheard_s(self, now: float) -> float:
@@ -170,7 +170,7 @@ class PlainStop:
     why: FrameOrigin
     began_at: float
     next_at: float
-    """When its next frame, or its next try, is due."""
+    """When the next frame of the stop, or its next try, is due."""
     commands: list[Pending]
     is_soft: bool
     index: int = 0

@@ -13,13 +13,13 @@ class PlainProfile:
     capabilities: frozenset[str]
     """Words of `schemas.words.CAPABILITIES`."""
     measures: frozenset[str]
-    """The sensor topics that it publishes, without `sensor/`."""
+    """The sensor topics of the car, without `sensor/`."""
     lights: frozenset[Light] = frozenset()
     servos: frozenset[ServoAction] = frozenset()
     cells: int = 2
-    """Number of cells of its battery. The level of the battery depends on it."""
+    """Number of cells of the battery. The level of the battery depends on it."""
     baud: int = 115200
-    """Rate of its serial port."""
+    """Rate of the serial port."""
     dead_man_s: float | None = None
     """Time after which the car stops because no *motion* arrived, or None if there is no such time. A car with such a
     time gets no repeats of a stop that no reading shows. A car that only watches its link (a heartbeat, a closed
@@ -35,12 +35,12 @@ class PlainProfile:
 
     @property
     def possible_modes(self) -> frozenset[Mode]:
-        """The modes that it may be in."""
+        """The modes that the car may be in."""
         return self.modes
 
     @property
     def has_readings(self) -> bool:
-        """False if it never sends a reading."""
+        """False if the car never sends a reading."""
         return bool(self.measures)
 
     def measurable(self, mode: Mode) -> frozenset[str]:

@@ -83,8 +83,8 @@ CONFIRM_S: Final = 0.3
 """Time within which a car repeats a setting: the longest turn of its loop, and the delay of a slow link."""
 SILENT_TRIES: Final = 3
 BLIND_TRIES: Final = 10
-"""How often the settings are sent to a car that repeats no line: SILENT_TRIES if its feedback arrives at the interval
-that we set, which shows that our lines arrive, else BLIND_TRIES."""
+"""How often the settings are sent to a car that repeats no line. SILENT_TRIES counts if its feedback comes at the
+interval that we set, because that shows that our lines arrive. Otherwise BLIND_TRIES counts."""
 ECHO_TRIES: Final = 3
 """Number of tries of a stop without an echo after which the car's echo counts as switched off."""
 STANDS_S: Final = 0.25

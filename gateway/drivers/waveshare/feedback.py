@@ -32,7 +32,7 @@ class Feedback:
     raw: bytes
     at: float
     firmware: UgvFirmware | None
-    """None if its fields fit neither firmware, or both."""
+    """None if the fields of the report fit neither firmware, or both."""
     left_m_s: float
     right_m_s: float
     """Speeds of the wheels as the car reports them. They are measured only if `Chassis.has_encoders`."""

@@ -103,7 +103,7 @@ class CarModel:
 
     @property
     def shows(self) -> Shows:
-        """Return whether its reports were seen to react to frames."""
+        """Return whether the reports of the car were seen to react to frames."""
         return self.learned.shows
 
     @property

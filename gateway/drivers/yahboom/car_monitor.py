@@ -125,7 +125,7 @@ class CarMonitor:
                 model.believed.fan = False
 
     def _log_delivery(self, finding: Finding, now: float) -> None:
-        """Log once that a stop did not reach a car that has shown its stops, and once that it reacts again."""
+        """Log once that a car that has shown stops did not react to one, and once that it reacts again."""
         name = self.model.name
         if finding is Finding.LOST and self.model.learned.shows is Shows.YES:
             self.lost_frames += 1

@@ -34,8 +34,8 @@ contradicts the mode."""
 NOTICE_S: Final = 2 * TICK_S
 """Maximum time within which a silence is noticed: the ticks of a busy gateway come late."""
 NO_REPEAT_S: Final = 2 * FLIGHT_S
-"""Time before the end of a drive in which its motion is not repeated. An stm32 car that is sending a report, which
-takes 43 ms, would lose the stop that follows the repeated motion."""
+"""Time before the end of a drive in which its motion is not repeated. An stm32 car needs 43 ms to send a
+report. If the repeated motion and the stop after it arrive in that time, the car loses the stop."""
 
 
 class Executor(Driver):

@@ -33,7 +33,7 @@ KEPT_INTERVALS: Final = 9
 SAME_S: Final = 0.18
 """Maximum difference of intervals that belong to one rhythm. Those of one car differ by up to 0.08 s each way."""
 FIRM_INTERVALS: Final = 4
-"""Number of intervals from which their spread counts as known."""
+"""Minimum number of intervals to know their spread."""
 FIRST_TOLERANCE_S: Final = 0.12
 """Tolerance until the spread is known."""
 LINK_TOLERANCE_S: Final = 0.05

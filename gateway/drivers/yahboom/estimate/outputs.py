@@ -24,7 +24,7 @@ class StateEstimate:
     fan_at: float = float("-inf")
     """When the fan was last toggled."""
     fan_toggled: bool = False
-    """True if it was toggled, and no reading has arrived since the fan reached its new state."""
+    """True if the fan was toggled, and no reading has arrived since it reached its new state."""
     servo_deg: int | None = None
     led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
     speed: float = field(init=False)

@@ -150,7 +150,7 @@ class Profile:
 
     @property
     def dialect(self) -> Dialect:
-        """The spelling of its frames, for `Decoder` and `encode`."""
+        """The spelling of the car's frames, for `Decoder` and `encode`."""
         head = next((option.partition("=")[2] for option in self.options if option.startswith(HEAD)), STANDARD_HEAD)
         return Dialect(head, swaps_green_and_blue=self.kind is Platform.STM32)
 
@@ -171,12 +171,12 @@ class Profile:
 
     @property
     def cells(self) -> int:
-        """The number of cells of its battery."""
+        """The number of cells of the car's battery."""
         return 3 if "3s" in self.options else 2
 
     @property
     def baud(self) -> int:
-        """The rate of its UART, baud."""
+        """The rate of the car's UART, baud."""
         return BAUD
 
     @property

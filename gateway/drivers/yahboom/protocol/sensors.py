@@ -40,7 +40,7 @@ class SensorField:
 
     @property
     def topic(self) -> str:
-        """The topic of its messages."""
+        """The topic of the messages with this field."""
         return f"sensor/{self.measurement}"
 
     def accepts(self, text: bytes) -> bool:

@@ -40,7 +40,7 @@ class StopSequence:
 
     @property
     def is_recovery(self) -> bool:
-        """Return True if it brings a car in an unknown state to rest, by a lone `#` and `MODE00`."""
+        """Return True if the sequence brings a car in an unknown state to rest, by a lone `#` and `MODE00`."""
         return self.name == RECOVERY.name
 
 

@@ -49,9 +49,9 @@ IN_TIME_S: Final = 0.2
 def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
     """Return the kind of stop for a car.
 
-    `doubted`: its readings contradict its platform. `open_mode`: they show a mode other than 0. A named frame is sent
-    only to a car whose platform or whose readings show that it understands such frames, because a named frame ends the
-    program of some other cars (docs/reference/protocol.md#programs-that-people-have).
+    `doubted`: its readings contradict its platform. `open_mode`: they show a mode other than 0. A named frame ends
+    the program of some cars (docs/reference/protocol.md#programs-that-people-have). So it is sent only if the platform
+    or the readings of the car show that the car understands it.
     """
     if profile.stop_style is StopStyle.GENERAL:
         return StopStyle.BOTH if open_mode else StopStyle.GENERAL
@@ -132,7 +132,7 @@ class StopInProgress:
     first_at: float | None = None
     """When the first frame of the stop was written."""
     last_at: float = float("-inf")
-    """When its last frame was written."""
+    """When the last frame of the stop was written."""
     other_at: float = float("-inf")
     """When the last frame of another command was written during the stop."""
     closed_at: float = float("-inf")
@@ -161,7 +161,7 @@ class StopInProgress:
     mode_command: Pending | None = None
     """The mode command for which this stop is sent first."""
     repeats: bool = False
-    """True if it repeats a stop whose first frames are written already. Then a command may replace it at once."""
+    """True if this stop repeats one whose first frames are written already. Then a command may replace it at once."""
     at_rest: bool = False
     """True if the car had shown that it stands still before it fell silent. Then it gets only general stops: unlike a
     named frame, a general stop that loses bytes cannot start the motors."""
@@ -175,7 +175,7 @@ class StopInProgress:
 
     @property
     def is_soft(self) -> bool:
-        """Return True if it is the end of a drive."""
+        """Return True if the stop is the end of a drive."""
         return self.sequence.rank == sequences.SOFT.rank
 
     @property
