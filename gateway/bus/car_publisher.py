@@ -116,7 +116,8 @@ class CarPublisher:
     def keep_pose(self, sample: bus.Sample, now: float) -> None:
         """Store a pose that a program outside the car has published, so that queries are answered with it.
 
-        Drop and count a payload that is not a pose, or whose numbers are not finite: no program of ours sends it.
+        Drop and count a payload that is not a pose, and a pose with a number that is not finite: no program of ours
+        sends such a thing.
         """
         name = "sensor/pose"
         if sample.deleted or sample.unread:

@@ -28,9 +28,9 @@ class HeldMotion:
     duration_s: float = 0.0
     """How long the drive lasts after its frame is written. 0 for a stream: each sample counts from its arrival."""
     began_at: float | None = None
-    """When its frame was written, or None if it still waits."""
+    """When the frame of the drive was written, or None if the drive still waits."""
     range_cm: float | None = None
-    """The distance before its frame was written, if it is known."""
+    """The distance before that frame was written, if it is known."""
 
     @property
     def sender(self) -> Sender:

@@ -60,7 +60,7 @@ class Device(ABC):
     @property
     @abstractmethod
     def likely(self) -> str:
-        """Why it probably belongs to a car. Empty for any other device."""
+        """Why the device probably belongs to a car. Empty for any other device."""
 
 
 class LinkKind(ABC, Generic[Url]):

@@ -44,7 +44,7 @@ class BleDevice(Device):
 
     @property
     def likely(self) -> str:
-        """A text with its UART service. Empty if it has none."""
+        """A text with the UART service of the device. Empty if it has none."""
         return "" if self.uart is None else f"it has the Bluetooth service {self.uart}"
 
 

@@ -83,11 +83,11 @@ class MovingObject:
 
     @property
     def extent_m(self) -> float:
-        """The distance from its middle to its farthest point."""
+        """The distance from the middle of the thing to its farthest point."""
         return self.radius_m or hypot(self.width_m, self.depth_m) / 2
 
     def pose(self, at_s: float) -> Pose:
-        """Return its pose. The pose of a carried thing is in the frame of its car."""
+        """Return the pose of the thing. The pose of a carried thing is in the frame of its car."""
         if not self.path:
             return Pose(self.x_m, self.y_m, self.heading_rad)
         ends = _ends(self.path)

@@ -33,7 +33,7 @@ A car at full speed is almost still after some 0.1 s.
 """
 UGV_DEAD_MAN_S: Final = 3.0
 UGV_LIMIT_M_S: Final = 2.0
-"""Above it, a car with a closed speed loop ignores the speeds of a command. The command still restarts the dead-man."""
+"""A car with a closed speed loop ignores speeds above this. The command still restarts the dead-man timer."""
 MAX_DOCUMENT: Final = 256
 BATTERY_S: Final = 10.0
 PAGE_S: Final = 1.5
