@@ -33,11 +33,11 @@ class CarProfile(Protocol):
 
     @property
     def lights(self) -> frozenset[Light]:
-        """The colors of its light."""
+        """The colors of the car's light."""
 
     @property
     def servos(self) -> frozenset[ServoAction]:
-        """The steps of its servos."""
+        """The steps of the car's servos."""
 
     @property
     def has_readings(self) -> bool:
@@ -45,11 +45,11 @@ class CarProfile(Protocol):
 
     @property
     def cells(self) -> int:
-        """The number of cells of its battery."""
+        """The number of cells of the car's battery."""
 
     @property
     def baud(self) -> int:
-        """The rate of its UART, baud."""
+        """The rate of the car's UART, baud."""
 
     @property
     def dead_man_s(self) -> float | None:

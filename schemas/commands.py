@@ -38,11 +38,11 @@ class CommandType(NamedTuple):
     ttl_s: float = 2.0
     """Default of the maximum age at arrival (docs/reference/commands.md#payload)."""
     wildcard: bool = False
-    """True if one query may address several cars (docs/reference/keys.md#command-keys)."""
+    """True if one query of the command may address several cars (docs/reference/keys.md#command-keys)."""
     stops: bool = False
-    """True if it needs no payload, and stops the car even if the payload is invalid."""
+    """True if the command needs no payload, and stops the car even if the payload is invalid."""
     max_duration_s: float = 0.0
-    """Maximum of its field `duration_s`. 0 if it has none, or if each gateway has a limit of its own."""
+    """Maximum of the field `duration_s`. 0 if there is none, or if each gateway has a limit of its own."""
     min_duration_s: float = 0.0
     """Minimum of the field `duration_s`. 0 if any duration above 0 is allowed."""
     signal: bool = False

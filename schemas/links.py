@@ -60,9 +60,9 @@ class LinkUrl(ABC):
 
     scheme: ClassVar[str]
     forms: ClassVar[tuple[str, ...]]
-    """How its URL is written, for the help."""
+    """How a URL of this kind is written, for the help."""
     options: ClassVar[str] = ""
-    """What may follow its URL, for the help."""
+    """What may follow such a URL, for the help."""
     module: ClassVar[str] = ""
     """The Python module that this kind of link needs and the basic installation lacks. Empty if none."""
     extra: ClassVar[str] = ""
@@ -153,7 +153,7 @@ class SerialUrl(_SerialLine):
         return ("device", device, frozenset())
 
     def check(self, look: Look) -> tuple[bool, str]:
-        """Look for it without opening it."""
+        """Look for the port without opening the link."""
         return look.device(self.path)
 
     def __str__(self) -> str:
@@ -191,7 +191,7 @@ class UsbUrl(_SerialLine):
                 yield (kind, where, frozenset(fewer))
 
     def check(self, look: Look) -> tuple[bool, str]:
-        """Look for it without opening it."""
+        """Look for the device without opening the link."""
         return look.usb(self)
 
     def __str__(self) -> str:
@@ -242,7 +242,7 @@ class TcpUrl(LinkUrl):
         return ("tcp", _host(self.host), frozenset({("port", str(self.port))}))
 
     def check(self, look: Look) -> tuple[bool, str]:
-        """Look for it without opening it."""
+        """Look for the host without opening the link."""
         return look.host(self.host, self.port)
 
     def doubt_baud(self) -> str:

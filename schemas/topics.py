@@ -51,7 +51,7 @@ class Topic(NamedTuple):
 
     @property
     def encoding(self) -> str:
-        """The Zenoh encoding of its messages, with the full name in the schema part."""
+        """The Zenoh encoding of the messages of this topic, with the full name in the schema part."""
         return f"{PROTOBUF};{self.message}"
 
     @property

@@ -177,7 +177,7 @@ class Reason(StrEnum):
     LENT = "lent"
     """The car is lent to another person."""
     NOT_ALLOWED = "not_allowed"
-    """The people table does not allow it to this sender."""
+    """The people table does not allow the command to this sender."""
     PAUSED = "paused"
     HELD = "held"
     ESTOPPED = "estopped"

@@ -29,22 +29,22 @@ class Declared:
         self.undeclare()
 
     def add(self, session: zenoh.Session, number: int) -> None:
-        """Declare it in a session."""
+        """Make the declaration in a session."""
         self.current.append(self._declare(session, number))
 
     def undeclare(self) -> None:
-        """End it, in every session."""
+        """End the declaration in every session."""
         self.is_over = True
         while self.current:
             self.current.pop().undeclare()
 
     def keep_newest(self) -> None:
-        """End it in all sessions but the newest."""
+        """End the declaration in all sessions but the newest."""
         while len(self.current) > 1:
             self.current.pop(0).undeclare()
 
     def keep_oldest(self) -> None:
-        """Keep it only in the oldest session. The others are about to close, and end their declarations."""
+        """Keep the declaration only in the oldest session. The other sessions are about to close, and end theirs."""
         del self.current[1:]
 
 
@@ -59,7 +59,7 @@ class SampleChannel(Declared):
         """Return the next sample, or None if there is none. It is Zenoh's own method, as a wrapper would cost time."""
 
     def add(self, session: zenoh.Session, number: int) -> None:
-        """Declare it in a session. Read two declarations until the older one has ended and is empty."""
+        """Subscribe in a session. Read two declarations until the older one has ended and is empty."""
         super().add(session, number)
         if len(self.current) == 1:
             self.try_recv = self.current[0].handler.try_recv
@@ -68,12 +68,12 @@ class SampleChannel(Declared):
         self._read_both(self.try_recv, self.current[-1].handler.try_recv)
 
     def keep_newest(self) -> None:
-        """End it in all sessions but the newest. Samples that the older ones still hold can be read."""
+        """End the subscription in all sessions but the newest. Samples that the older ones still hold can be read."""
         super().keep_newest()
         self._older_is_over = True
 
     def keep_oldest(self) -> None:
-        """Keep it only in the oldest session. The others are about to close, and end their declarations."""
+        """Keep the declaration only in the oldest session. The other sessions are about to close, and end theirs."""
         super().keep_oldest()
         self.try_recv = self.current[0].handler.try_recv
 
