@@ -95,7 +95,7 @@ class Battery:
             self._other, self._since = shown, now
         else:
             # The readings may have shown different levels on this side of the current one, such as low and critical.
-            # Take the one that is nearer to the current level, because all of them show at least that.
+            # Take the level that is nearer to the current one, because all of these readings show at least that level.
             self._other = min(
                 self._other, shown, key=lambda each: abs(_LEVEL_RANK[each] - _LEVEL_RANK[self.level or each])
             )

@@ -138,7 +138,7 @@ class Controller(Generic[D_co]):
         return self.driver.mode_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
 
     def tick(self, now: float) -> None:
-        """Check for silence and for the end of a loan. Call it a few times a second."""
+        """Check for silence and for the end of a loan. It is called several times a second."""
         if self.safety.loan is not None and self.safety.loan_at(now) is None:
             self._end_loan(f"the loan of {self.car} to {self.safety.loan.to} is over", now)
         self.driver.tick(now)

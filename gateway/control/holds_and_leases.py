@@ -93,7 +93,7 @@ class Safety:
     # ------------------------------------------------------------------ hold and e-stops
 
     def put_on_hold(self, name: str, at_ns: int, rank: Rank = Rank.PERSON) -> None:
-        """Put the car on hold, and end a lease of the coordinator. A lead's hold replaces that of somebody else."""
+        """Put the car on hold, and end a lease of the coordinator. A lead's hold replaces any other hold."""
         if self.hold is None or (rank is Rank.LEAD and self.hold.rank is not Rank.LEAD):
             self.hold = Hold(name, at_ns, rank)
         if self.lease is not None and self.lease.holder.kind is Rank.COORDINATOR:
