@@ -42,7 +42,7 @@ class Family(Protocol):
         """Return the profile of each platform, with all parts that such a car may have."""
 
     def driver_of(self, name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
-        """Return a function that makes a car's driver. `kept`: the saved result of `Driver.kept`, or empty."""
+        """Return a function that makes a car's driver. `kept` is the saved result of `Driver.kept`, or empty."""
 
 
 def check_platform(text: str) -> str:

@@ -509,7 +509,7 @@ class PlainDriver(Driver):
         return self.part_frames(what) or ()
 
     def _apply(self, what: Action, now: float) -> None:
-        """Note the effect of a written action. Send the held motion again at once with a new speed."""
+        """Record the effect of a written action. Send the held motion again at once with a new speed."""
         if isinstance(what, ChangeSpeed):
             self._model.speed = min(1.0, max(SPEED_STEP, self._model.speed + _STEPS[what.step]))
             self._resend_at = now

@@ -196,7 +196,7 @@ class CarMonitor:
         return not waits and self.model.trust.state not in (CarTrust.DRIVING, CarTrust.IN_MODE)
 
     def tick(self, now: float) -> None:
-        """Check for silence, and for a detected platform. Call it a few times a second."""
+        """Check for silence, and for a detected platform. It is called several times a second."""
         self._apply_platform(now)
         model = self.model
         before = model.mode.verdict

@@ -98,8 +98,8 @@ class Executor(Driver):
             return True
         if self.stops.shutting_down:
             return False
-        # A soft stop may be replaced after its first frame, because the frame of any command stops the car's old motion
-        # as well as the second frame would.
+        # A soft stop may be replaced after its first frame, because the frame of any command ends the old motion just
+        # as the second frame would.
         is_soft = running.sequence.rank == SOFT.rank and running.index > 0
         return is_soft or now >= running.gives_way_at
 
@@ -264,7 +264,7 @@ class Executor(Driver):
         if running is None or not self._full_stop_runs:
             return True
         # A mode waits for the commands that were queued before it. So if a mode may go before the rest of the stop,
-        # these commands may, too. That is so for the mode for which the stop is sent, and for a mode that is newer.
+        # these commands may, too. Such a mode is the one for which the stop is sent, or a newer one.
         change = self.queue.mode_change
         newer = change if change is not None and change.received_at >= running.began_at else None
         modes = (running.mode_command, newer)

@@ -188,7 +188,7 @@ class Pacing:
     def open_at(self, now: float, *, can_show: bool) -> float:
         """Return when a mode may be opened."""
         # If the car is awake when the mode is opened, the block begins at once, and the car can later show that it left
-        # the mode. So wait for a report, but not for long, and not on a car that cannot show it.
+        # the mode. So wait for a report, but not for long. Do not wait on a car that cannot show it.
         alone = max(now, self.buffer_until, self.flight_until, self._framed_at + NAMED_GAP_S)
         if alone <= self.awake_until or not can_show:
             return alone

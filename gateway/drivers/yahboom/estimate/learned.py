@@ -224,7 +224,7 @@ class Learned:
         return True
 
     def on_reaction(self, *, sure: bool) -> None:
-        """Record that a report came late by the block of a frame. `sure`: a lost report could not cause this delay."""
+        """Record that a report was late by the block of a frame. With `sure`, no lost report could cause the delay."""
         self._unreacted = 0
         if self.shows is Shows.NO and sure:
             self._reacted += 1

@@ -29,8 +29,8 @@ SILENCE_MARGIN_S: Final = 0.75
 CORRUPTED_MATCH_S: Final = 0.5
 """Period after a reading of another mode in which a single match may be a corrupted frame, so three are required."""
 MAX_FADE_EXCUSE_S: Final = SERVO_S
-"""Maximum time by which blocks of our frames prolong a confirmation: that of a servo. A stream of actions must not keep
-a claim alive that no reading supports any more."""
+"""Maximum time by which blocks of our frames prolong a confirmation: the block of a servo. A stream of actions must not
+keep a claim alive that no reading supports any more."""
 MAX_BLOCKS: Final = 256
 """Maximum number of blocking frames that are remembered to excuse a silence, as during endless whistling."""
 

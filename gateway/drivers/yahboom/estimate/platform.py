@@ -1,6 +1,6 @@
 """Detects from the car's bytes which program runs on it, and checks the bytes against the configured profile.
 
-Two differences cannot be seen in the bytes. An arduino and an stm32 usually send the same. And no car reports its
+Two differences cannot be seen in the bytes. An arduino and an stm32 usually send the same bytes. And no car reports its
 lights, so the bytes do not show that light 1 of a raspberry_pi car changes its color each time. A single frame may be
 corrupted, so three in a row count.
 """
@@ -238,7 +238,7 @@ class PlatformDetector:
         return (words,) if self.note(words) else ()
 
     def _count_head(self, head: str | None) -> tuple[str, ...]:
-        """Count one sensors frame that begins with another word than those of this profile."""
+        """Count one sensors frame that does not begin with the head of this profile."""
         if head is None or head == self.profile.dialect.head:
             return ()
         self._other_head_frames = self._other_head_frames + 1 if head == self._other_head else 1

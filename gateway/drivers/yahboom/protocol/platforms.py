@@ -201,7 +201,7 @@ class Profile:
 
     @property
     def interval_s(self) -> float:
-        """The interval of reports in mode 0 until that of the car is learned, s."""
+        """The expected interval of reports in mode 0, s. It is used until the interval of the car is learned."""
         return REPORT_INTERVAL_S
 
     @property

@@ -49,9 +49,9 @@ IN_TIME_S: Final = 0.2
 def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
     """Return the kind of stop for a car.
 
-    `doubted`: its readings contradict its platform. `open_mode`: they show a mode other than 0. A named frame ends
-    the program of some cars (docs/reference/protocol.md#programs-that-people-have). So it is sent only if the platform
-    or the readings of the car show that the car understands it.
+    With `doubted`, its readings contradict its platform. With `open_mode`, they show a mode other than 0. A named frame
+    ends the program of some cars (docs/reference/protocol.md#programs-that-people-have). So it is sent only if the
+    platform or the readings of the car show that the car understands it.
     """
     if profile.stop_style is StopStyle.GENERAL:
         return StopStyle.BOTH if open_mode else StopStyle.GENERAL
