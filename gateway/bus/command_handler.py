@@ -35,7 +35,7 @@ command_log = logging.getLogger(json_log.COMMANDS)
 
 
 class CommandHandler:
-    """The commands of one car. Use it in the loop: `clock` is the loop's, `wake` wakes the writer.
+    """The commands of one car. It runs in the loop. `clock` is the loop's clock, and `wake` wakes the writer.
 
     `on_gap` looks for a gap of the loop: after a sleep of the computer, the car is stopped before the next command.
     """

@@ -83,7 +83,7 @@ class EstopSync:
     def forward(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
         """Send a fleet-wide e-stop, a pause, or the end of one to all gateways.
 
-        Call it for a command that came to this car only.
+        This is only for a command that came to this car alone.
         """
         fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
         payload: pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand

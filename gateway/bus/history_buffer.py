@@ -75,7 +75,7 @@ class HistoryBuffer:
         self._values = deque((replace(each, at=each.at - slept_s) for each in self._values), self._values.maxlen)
 
     def select(self, *, time_range: str | None, last: str | None, now: float) -> list[Value]:
-        """Return the latest value, those in a time range, or the `last` ones. `now`: monotonic. Raises BadRange."""
+        """Return the latest value, those in a time range, or the `last` ones. `now` is monotonic. Raises BadRange."""
         if time_range is None and last is None:
             return [self._values[-1]] if self._values else []
         values = list(self._values)

@@ -45,7 +45,8 @@ def kind_of(scheme: str) -> LinkKind[Any]:
 async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool = False) -> Link:
     """Open the link within this time. Raises CannotOpen, with a message that says what is wrong and what to do.
 
-    Gateways connect one after the other through a Bluetooth adapter. `first`: this car may be moving, so it goes first.
+    Gateways connect one after the other through a Bluetooth adapter. With `first`, this car may be moving, so it goes
+    first.
     """
     kind = kind_of(url.scheme)
     return await kind.open(url, kind.open_timeout_s if timeout_s is None else timeout_s, first=first)

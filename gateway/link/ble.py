@@ -161,7 +161,8 @@ class BleLink(BufferedLink):
         found, others = {address: dict(devices) for address, devices in known.items()}, dict[str, str]()
         self._stage = _not_found(self._url, others)
         more_s = NAMESAKE_SCAN_S if self._url.name is not None else OTHER_ADAPTERS_S
-        # Not `advertisement_data()`: it misses advertisements before the first call, which may be the only ones.
+        # Do not use `advertisement_data()`: it misses advertisements before the first call, and these may be the only
+        # ones.
         queue = asyncio.Queue[tuple[str | None, BLEDevice, AdvertisementData]]()
         async with contextlib.AsyncExitStack() as scanners:
             for name in adapters:
@@ -374,7 +375,7 @@ KIND: Final = BleKind()
 def choose(
     services: Iterable[BleakGATTService],
 ) -> tuple[BleakGATTCharacteristic, BleakGATTCharacteristic] | None:
-    """Return the notifying and the writable characteristic of a UART, often the same. None if there is no UART."""
+    """Return the notifying and the writable characteristic of a UART, which are often one. None if there is no UART."""
     available = list(services)
     for uuids, notifying, writable in _UARTS:
         found = [each for service in available if service.uuid in uuids for each in service.characteristics]

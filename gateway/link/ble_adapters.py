@@ -28,7 +28,7 @@ _BLUEZ: Final = "org.bluez"
 
 
 class Turn:
-    """The turn of one gateway to connect through one adapter. `first`: its car may be moving."""
+    """The turn of one gateway to connect through one adapter. With `first`, its car may be moving."""
 
     def __init__(self, adapter: str, *, first: bool, directory: Path | None = None) -> None:
         self._first = first

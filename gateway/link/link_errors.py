@@ -6,7 +6,7 @@ class LinkError(Exception):
 
 
 class BadUrl(LinkError):
-    """The URL is not that of a link. This is wrong use."""
+    """The URL names no link. This is wrong use."""
 
 
 class CannotOpen(LinkError):

@@ -52,7 +52,8 @@ def list_ports() -> "list[ListPortInfo]":
         try:
             return list(system.comports())
         except (OSError, TypeError, ValueError) as error:
-            # The device was unplugged while pyserial read its entry: it parses a number that it could not read.
+            # The device was unplugged while pyserial read its entry: pyserial then parses a number that it could not
+            # read.
             failure = error
             time.sleep(LIST_RETRY_DELAY_S)
     reason = " ".join(str(failure).split()) or type(failure).__name__

@@ -25,7 +25,7 @@ class EndpointError(Exception):
 
 
 class Taken(EndpointError):
-    """The path of a link is in use. The exit code is that of wrong arguments."""
+    """The path of a link is in use. The exit code is the one for wrong arguments."""
 
 
 class Owner(Protocol):

@@ -133,7 +133,7 @@ class MovingObject:
         return turned_box(pose.x_m, pose.y_m, pose.heading_rad, self.width_m, self.depth_m)
 
     def depth(self, pose: Pose, x: float, y: float, radius: float) -> float:
-        """Return how deep a disc at x, y overlaps the thing; negative: the distance between them."""
+        """Return how deep a disc at x, y overlaps the thing. If negative, it is the distance between them."""
         if self.radius_m:
             return radius + self.radius_m - hypot(x - pose.x_m, y - pose.y_m)
         fx, fy = self._nearest(pose, x, y)

@@ -100,9 +100,9 @@ class Stm32Car(ModeCar):
     def _obey_buffer(self) -> None:
         """Obey the buffer if a frame was complete since the last look, whatever is in it now.
 
-        If another frame has begun since then, its beginning has overwritten that of the complete one. This call clears
-        the buffer with that beginning. The rest of the new frame arrives later and is put behind the cleared place. So
-        the program then reads an empty string.
+        If another frame has begun since then, its beginning has overwritten that of the complete frame. This call
+        clears the buffer with that beginning. The rest of the new frame arrives later and is put behind the cleared
+        place. So the program then reads an empty string.
         """
         self._interrupt()
         if not self._complete:

@@ -112,7 +112,7 @@ class World:
         return cls()
 
     def start_pose(self, index: int, name: str = "") -> Pose:
-        """Return the start pose of a car: its own from the world file, or that of number `index` along the line.
+        """Return the start pose of a car: its own from the world file, or number `index` along the line.
 
         In a lively world, a car without a place of its own starts where there is room.
         """
