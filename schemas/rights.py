@@ -218,7 +218,7 @@ class Loan:
 
 @dataclass(frozen=True, slots=True)
 class LeaseState:
-    """The sender who controls the car. `until`: s, monotonic, known only to the gateway."""
+    """The sender who controls the car. `until` (s, monotonic) is known only to the gateway."""
 
     holder: Sender
     until: float = inf

@@ -21,7 +21,7 @@ MIN_SIZE_M: Final = 0.02
 def check_world(text: str, source: str, cars: Sequence[str] | None = None) -> WorldEntry:
     """Return the fields of the world in a text. Raises BadFile with every fault, if any.
 
-    `source` is the name of the file in errors. `cars` are the cars that can carry something; None: any car.
+    `source` is the name of the file in errors. `cars` are the cars that can carry something. With None, any car can.
     """
     document = Document(text, source)
     # Look for further faults in the values that are valid.

@@ -54,7 +54,7 @@ class StartEntry(Entry):
 
 
 def _place(unless: str, offset: str) -> Any:
-    """Return a coordinate of a thing or a lamp. `unless`: when it may be left out. `offset`: its meaning if carried."""
+    """Return a coordinate of a thing or a lamp. `unless` says when it may be left out, `offset` what it means."""
     words = f"where it stands, meters, required unless {unless}; if carried, how far {offset}"
     return Field(default=0.0, description=words)
 

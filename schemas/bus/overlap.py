@@ -55,7 +55,7 @@ class Overlap:
 
 
 def mark_of_sample(declaration: int, sample: zenoh.Sample) -> Hashable:
-    """Return the mark of a sample: no other sample has it. Its time is that of its sender, or of the first hub."""
+    """Return the mark of a sample: no other sample has it. The time stamp is from the sender, or from the first hub."""
     stamp = sample.timestamp
     when = None if stamp is None else (stamp.get_time_as_ntp64().as_nanos(), str(stamp.get_id()))
     return declaration, str(sample.key_expr), when

@@ -224,7 +224,7 @@ class Bus:
     def _is_twin(self, number: int, mark: Callable[[], Hashable], within_s: float = inf) -> bool:
         """Return True if the other session handles this message, so that this copy must be dropped.
 
-        `number` is the session over which this copy came. `within_s`: see `Overlap.is_twin`.
+        `number` is the session over which this copy came. For `within_s`, see `Overlap.is_twin`.
         """
         overlap, is_newest = self._overlap, number == self._number
         if overlap is None:
@@ -385,8 +385,8 @@ class Bus:
         A link that was lost is awaited for up to 2 s, unless the session watches this expression.
         """
         # Zenoh answers a session without a link at once, as if there were no tokens. And right after a watch was
-        # declared or a new link was opened, it leaves out of an answer the tokens that are on their way to that watch.
-        # So a session with watches asks twice over each new link: the second answer comes behind those tokens.
+        # declared or a new link was opened, an answer lacks the tokens that are still on their way to that watch. So a
+        # session with watches asks twice over each new link: the second answer comes behind those tokens.
         wanted, end = zenoh.KeyExpr(expression), monotonic() + timeout_s
         link_end = min(end, monotonic() + _LINK_TIMEOUT_S)
         while True:

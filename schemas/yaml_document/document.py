@@ -254,13 +254,13 @@ class Document:
             where, on_key = self._place_of(each["loc"], missing=each["type"] == "missing")
             errors.append((where, on_key or each["type"] == "extra_forbidden", each))
         # A value of a union gets errors from each member. "Wrong type" from one member is noise if another member
-        # accepts the type, and reports a fault inside the value or another fault of the value.
+        # accepts the type and reports only another fault of the value, or a fault inside it.
         accepted = {where[:depth] for where, _, _ in errors for depth in range(len(where))}
         accepted |= {where for where, _, each in errors if not each["type"].endswith("_type")}
         return [each for each in errors if each[0] not in accepted or not each[2]["type"].endswith("_type")]
 
     def _place_of(self, loc: Sequence[str | int], *, missing: bool) -> tuple[Where, bool]:
-        """Return the place of pydantic's loc (which also names members of unions), and True if it is that of a key."""
+        """Return the place of pydantic's loc (which also names members of unions), and True if it is a key's place."""
         where: Where = ()
         for part in loc[:-1] if missing else loc:
             if self._partial.original((*where, part)) in self._places:
