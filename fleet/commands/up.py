@@ -52,7 +52,7 @@ missing and why. With --sim and --json, lines on stdin go to the simulator (`gat
 stopped at the end, new gateways try again to stop it until the next Ctrl-C.
 
 With --detach the command returns when all cars are ready. It also returns if no further car becomes ready for 30 s
-(10 s if all that is missing is cars whose links cannot be opened). In both cases the fleet keeps running:
+(10 s if only cars whose links cannot be opened are missing). In both cases the fleet keeps running:
 `fleet logs supervisor` shows its log, `fleet down` ends it.
 
 Exit codes: 0 every car was stopped (with --detach: all are ready), 1 a car was not, or nothing started, or not
