@@ -35,7 +35,7 @@ from schemas.topics import Qos, Topic
 # On a busy machine, existing tokens arrive late. A token that disappears meanwhile never arrives, so there is a limit.
 _TOKEN_HISTORY_TIMEOUT_S: Final = 2.0
 """Timeout for the existing tokens at the start of a watch."""
-_LINK_TIMEOUT_S: Final = 2.0
+LINK_TIMEOUT_S: Final = 2.0
 """Time for which a question for tokens waits for a lost link. After 0.2 to 0.5 s a session has its link again."""
 _LINK_POLL_S: Final = 0.02
 _PROMPT_S: Final = 1.0
@@ -388,7 +388,7 @@ class Bus:
         # declared or a new link was opened, an answer lacks the tokens that are still on their way to that watch. So a
         # session with watches asks twice over each new link: the second answer comes behind those tokens.
         wanted, end = zenoh.KeyExpr(expression), monotonic() + timeout_s
-        link_end = min(end, monotonic() + _LINK_TIMEOUT_S)
+        link_end = min(end, monotonic() + LINK_TIMEOUT_S)
         while True:
             asked_at, link, asked_over = monotonic(), self._link(), self._asked_over
             with self._lock:
