@@ -179,17 +179,18 @@ class FoxgloveServer:
             old = self._channels[topic]
             schema = old.schema()
             old.close()  # else the SDK would give us the same one
-            new = self._channels[topic] = self._open(topic, schema)
-            if topic in self._last:  # a client that has just subscribed got it on the old channel, if at all
-                payload, at_ns = self._last[topic]
-                new.log(payload, log_time=at_ns)
+            self._channels[topic] = self._open(topic, schema)
+            self._repeat_last(topic)  # a client that has just subscribed got it on the old channel, if at all
 
     def _on_subscribe(self, client: Client, channel: ChannelView) -> None:
         """Send the last message to a client that subscribes to states or events. Runs on a thread of the SDK."""
-        if (last := self._last.get(channel.topic)) is None:
-            return
-        payload, at_ns = last
-        self._channels[channel.topic].log(payload, log_time=at_ns, sink_id=client.id)
+        self._repeat_last(channel.topic, client.id)
+
+    def _repeat_last(self, topic: str, client: int | None = None) -> None:
+        """Send the last message of a topic of states or events to one client, or to all that subscribe."""
+        if (last := self._last.get(topic)) is not None:
+            payload, at_ns = last
+            self._channels[topic].log(payload, log_time=at_ns, sink_id=client)
 
 
 class _Listener(ServerListener):
