@@ -360,10 +360,10 @@ def _stop_first(endpoint: str, car: str) -> None:
 def _tries(within_s: float) -> Iterator[bool]:
     """Yield once for each try within this time: True if it is the last one."""
     deadline = time.monotonic() + within_s
-    while not (is_last := time.monotonic() > deadline):
-        yield is_last
+    while time.monotonic() <= deadline:
+        yield False
         time.sleep(TRY_INTERVAL_S)
-    yield is_last
+    yield True
 
 
 def _own_store(endpoint: str) -> HubStore:
