@@ -25,9 +25,7 @@ MAX_SENDERS: Final = 256
 class SenderBudgets:
     """The budgets of all senders. Times: s, monotonic."""
 
-    def __init__(self, per_s: float = DRIVES_PER_S, at_once: float = DRIVES_AT_ONCE) -> None:
-        self._per_s = per_s
-        self._at_once = at_once
+    def __init__(self) -> None:
         self._buckets: dict[str, TokenBucket] = {}
         self.dropped = 0
         """Number of messages over a budget."""
@@ -42,7 +40,7 @@ class SenderBudgets:
         if bucket is None:
             if len(self._buckets) >= MAX_SENDERS:
                 del self._buckets[next(iter(self._buckets))]
-            bucket = self._buckets[sender] = TokenBucket(self._per_s, self._at_once)
+            bucket = self._buckets[sender] = TokenBucket(DRIVES_PER_S, DRIVES_AT_ONCE)
         if bucket.take_one(now):
             return True
         self.dropped += 1
