@@ -41,7 +41,7 @@ from schemas import messages
 from schemas.commands import COMMANDS
 from schemas.keys import NAME_RULE, is_name
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
-from schemas.platform_name import AUTO, normalize_name
+from schemas.platform_name import AUTO
 from schemas.rights import Sender
 from schemas.topics import TOPICS
 from schemas.words import CAPABILITIES, Basis, FrameOrigin, Mode, Motion, Motors, Phase, Rank, ServoAction, SpeedStep
@@ -226,7 +226,7 @@ def _connected(family: Family, platform: str, samples: Sequence[bytes] = ()) -> 
 
 def check_names(family: Family, platform: str) -> Iterator[str]:
     """Check that a fleet file can name the platform, and that a wrong option is refused with a ValueError."""
-    if platform != normalize_name(platform) or not is_name(platform):
+    if not is_name(platform):
         yield f"{platform!r} cannot be named in a fleet file: use {NAME_RULE}"
     if family.PLATFORMS.count(platform) > 1:
         yield f"PLATFORMS has {platform} twice"
