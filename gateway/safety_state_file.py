@@ -83,7 +83,8 @@ class SafetyStateFile:
     def _words(self, other: _OfLink, more: int) -> str:
         kept = [] if other.hold is None else [f"the hold of {other.hold.by}"]
         kept += [f"the e-stop of {estop.by}" for estop in other.estops]
-        kept += [] if other.loan is None else [f"the loan to {other.loan.to}"]
+        if other.loan is not None:
+            kept.append(f"the loan to {other.loan.to}")
         verb = "belongs" if len(kept) == 1 else "belong"
         words = f"{' and '.join(kept)} {verb} to the car at {other.link}, not to the one at {self._link}"
         return printable(words + (f" (and those of {more} more links)" if more else ""), "?")
@@ -98,7 +99,8 @@ def _exchanged(
     mine = next((each for each in others if each.link == now), _OfLink(now, None, (), None))
     left = _OfLink(was, state.hold, of_car, state.loan)
     kept = [each for each in others if each.link not in (was, now)]
-    kept += [] if left.is_empty else [left]
+    if not left.is_empty:
+        kept.append(left)
     state = replace(state, hold=mine.hold, loan=mine.loan, estops=of_fleet + mine.estops)
     return tuple(kept[-MAX_OTHER_LINKS:]), state
 

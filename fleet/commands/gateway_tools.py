@@ -25,7 +25,8 @@ when a connection to it ends."""
 def scan(links: tuple[str, ...], listen: str | None, *, probe: bool, as_json: bool) -> None:
     """Look for cars on Bluetooth and serial ports. The scan only listens, so no car moves."""
     words = [word for link in links for word in ("--link", link)]
-    words += [] if listen is None else ["--for", listen]
+    if listen is not None:
+        words += ["--for", listen]
     _run_gateway("scan", *words, *(["--probe"] if probe else []), *(["--json"] if as_json else []))
 
 

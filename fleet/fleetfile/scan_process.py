@@ -45,7 +45,8 @@ def scan(links: Sequence[str], seconds: float | None) -> list[FoundLink]:
         return taken
     command = [sys.executable, "-m", "gateway.cli", "scan", "--json"]
     command += [word for link in links for word in ("--link", link)]
-    command += [] if seconds is None else ["--for", f"{seconds:g}s"]
+    if seconds is not None:
+        command += ["--for", f"{seconds:g}s"]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=None, text=True, check=False)
     if done.returncode == 130:
         raise KeyboardInterrupt
