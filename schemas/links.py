@@ -62,7 +62,7 @@ class LinkUrl(ABC):
     forms: ClassVar[tuple[str, ...]]
     """How a URL of this kind is written, for the help."""
     options: ClassVar[str] = ""
-    """What may follow such a URL, for the help."""
+    """The options that may follow such a URL, for the help."""
     module: ClassVar[str] = ""
     """The Python module that this kind of link needs and the basic installation lacks. Empty if none."""
     extra: ClassVar[str] = ""

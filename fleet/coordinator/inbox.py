@@ -40,7 +40,7 @@ Item = Sample | QueriedSample | zenoh.Query
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What a program that only listens takes from its inbox at once: messages, and gateways that came or left."""
+    """Messages, and gateways that came or left: one batch from the inbox of a program that only listens."""
 
     now: float
     """The time at which they were taken from the inbox, s, monotonic."""

@@ -122,7 +122,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     rules = follow_rules(plan, snapshot, cars, phase.name, memory.rules, now)
     phase = follow_phase(plan, snapshot, cars, phase, rules, now, ready=_is_ready(snapshot, subjects, barriers, memory))
     needs = follow_needs(plan, snapshot, subjects, memory.needs, now)
-    # What would change a decision depends on the phase, so drop the words of another phase.
+    # A decision says when it would change. That depends on the phase, so drop the decisions of another phase.
     reusable = memory.decisions if phase.name == memory.phase.name else {}
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
     if now - started_at < FIRST_STATE_TIMEOUT_S and any(

@@ -210,7 +210,7 @@ class DriverClaims(Protocol):
 
     @property
     def shows(self) -> Shows:
-        """Whether the reports of the car show that a stop arrived."""
+        """Says if the reports of the car show that a stop arrived."""
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:

@@ -212,7 +212,7 @@ _DEEDS: Final = {
     Right.LEND: "lend {car}",
     Right.END_LOAN: "end the loan of {car}",
 }
-"""What some rights allow, in the words of a refusal."""
+"""The actions that some rights allow, in the words of a refusal."""
 
 
 def _refusal(denial: Denial, sender: Sender, context: CommandContext, right: Right | None = None) -> Refusal:

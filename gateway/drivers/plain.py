@@ -146,7 +146,7 @@ class PlainModel:
 
     @property
     def shows_stops(self) -> tuple[Shows, str]:
-        """Whether the readings of the car show that a stop arrived, with the reason."""
+        """Says if the readings of the car show that a stop arrived, with the reason."""
         return self.shows, self.shows_words
 
     def unheard_s(self, now: float) -> float:
