@@ -17,6 +17,7 @@ from typing import Any
 
 from gateway.control.commands import Action, AimServo, Command, Drive, EmergencyStop, Led, SetMode, Signal, Stop
 from gateway.control.control_output import CommandRecord
+from gateway.control.driver import TICK_S
 from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.drivers.yahboom.estimate.mode import MAX_FADE_EXCUSE_S
 from gateway.drivers.yahboom.protocol.decoder import Decoder
@@ -35,7 +36,6 @@ from tests.support.controls import control
 from tests.support.stops import WORLDS, before_a_wall, in_a_pen, on_black
 
 BYTES_PER_S = 960
-TICK_S = 0.2
 FALSE_S = 0.3
 """Maximum time that a claim may be false."""
 STANDS_S, AVOIDING_STANDS_S = 15.0, 20.0

@@ -13,7 +13,7 @@ from gateway import drivers
 from gateway.control.commands import Action, ChangeSpeed, Command, Drive, EmergencyStop, Find, Resume, SetLight, Stop
 from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.controller import Controller
-from gateway.control.driver import Driver, Fields
+from gateway.control.driver import TICK_S, Driver, Fields
 from gateway.drivers.waveshare.driver import ALLOWED, DRIVE, PWM
 from gateway.sim.car_options import UGV_OPTIONS
 from gateway.sim.model.factory import build_ugv
@@ -24,7 +24,6 @@ from schemas.rights import Sender
 from schemas.words import Basis, Light, Motion, Motors, Phase, Rank, Reason, SpeedStep
 
 STEP_S = 0.005
-TICK_S = 0.2
 BRAKE_S = 0.5
 """Time in which the wheels stand after their power is off, with a turn of the speed loop."""
 SETTLED_S = 9.0

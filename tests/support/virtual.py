@@ -1,10 +1,14 @@
-"""One gateway's control and one simulated car on virtual time, joined by a link without delay."""
+"""One gateway's control and one simulated car on virtual time, joined by a link without delay.
+
+Control checks silence as often as in a gateway. Bytes, deadlines and events of the car wake the loop when they are due.
+"""
 
 import random
 from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.control_output import CommandRecord, LogRecord
+from gateway.control.driver import TICK_S
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build
@@ -16,8 +20,6 @@ from schemas.rights import Sender
 from schemas.words import Level, Phase, Reason
 from tests.support.controls import control
 
-TICK_S = 0.05
-"""Interval at which control checks silence. Bytes, deadlines and events of the car wake the loop when they are due."""
 SHORTEST_S = 1e-6
 """Minimum step of time."""
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.control_output import CommandRecord, LogRecord
+from gateway.control.driver import TICK_S
 from gateway.control.holds_and_leases import PersistedSafety
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen
@@ -25,8 +26,7 @@ RUNNING = {
 }
 REPORT_S = 1.25
 RUNNING_S = 0.1
-TICK_S = 0.2
-"""Intervals of reports in mode 0, of readings in a mode that reports, and of the controller's ticks."""
+"""Intervals of reports in mode 0, and of readings in a mode that reports."""
 
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 RUN = b"$1,0,0,0,0,0,0,0,0#"
