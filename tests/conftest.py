@@ -54,12 +54,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep tests that share a fixture of their module on one worker.
 
     Without a group, every worker gets some of these tests, and starts the fleet or records the session once more.
-    Tests that compute come last, where workers in the background take them.
     """
-    items.sort(key=lambda item: scheduling.computes(item.nodeid))
     for item in items:
         if isinstance(item, pytest.Function) and item.get_closest_marker("xdist_group") is None:
             definitions = item._fixtureinfo.name2fixturedefs.values()
             used = (each for several in definitions for each in several if each.baseid.startswith("tests"))
             if any(each.scope == "module" for each in used):
                 item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+    scheduling.sort(items)

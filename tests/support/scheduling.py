@@ -1,10 +1,12 @@
 """Assigns tests to workers of pytest-xdist. Tests that compute have workers of their own, of low priority."""
 
 import os
+from collections import Counter
 from pathlib import Path
 from typing import Final
 
 import pytest
+from xdist.remote import Producer
 from xdist.scheduler.loadgroup import LoadGroupScheduling
 from xdist.workermanage import WorkerController
 
@@ -21,6 +23,9 @@ WORKERS: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS) + _PROCESSORS
 _MIN_TESTS: Final = 1000
 """Minimum number of tests for workers in the background."""
 _LOWEST_PRIORITY: Final = 19
+_ASSIGNED_TOGETHER: Final = 8
+"""Number of short tests of a file that one worker gets with one message. With a message for each test, the messages and
+the bookkeeping of pytest-xdist took as long as 4,000 of its shortest tests."""
 _AUTOGROUP: Final = Path("/proc/self/autogroup")
 """The file that sets the priority of a session on Linux. With autogroups, Linux shares the processors equally among
 sessions, and `nice` counts only within a session: beside two workers at the lowest priority, a gateway in a session of
@@ -45,6 +50,8 @@ _COMPUTING: Final = (
     "tests/test_",
 )
 """Places of tests that compute on virtual time, or read files. All other tests wait for processes, cars and seconds."""
+_LONG: Final = ("tests/fuzz/",)
+"""Places of tests that take seconds. They are assigned one by one."""
 _STARTING: Final = ("tests/fleet/replay/analysis/test_replan.py", "tests/fleet/replay/rerun/test_live.py")
 """Files in these places that start processes. At low priority, a Rerun viewer took longer than 40 s to go on."""
 
@@ -52,6 +59,18 @@ _STARTING: Final = ("tests/fleet/replay/analysis/test_replan.py", "tests/fleet/r
 def computes(nodeid: str) -> bool:
     """Return True if a test only computes."""
     return nodeid.startswith(_COMPUTING) and not nodeid.startswith(_STARTING)
+
+
+def sort(items: list[pytest.Item]) -> None:
+    """Put tests that compute last, where workers in the background take them. Put large groups first."""
+    sizes = Counter(_group(item) for item in items)
+    items.sort(key=lambda item: (computes(item.nodeid), -sizes[_group(item)] if _group(item) else 0))
+
+
+def _group(item: pytest.Item) -> str:
+    """Return the group of a test, which runs on one worker. Empty if the test has none."""
+    mark = item.get_closest_marker("xdist_group")
+    return str((*mark.args, *mark.kwargs.values())[0]) if mark is not None else ""
 
 
 def in_background(worker: str, workers: int, tests: int) -> bool:
@@ -75,6 +94,23 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
     Workers in the background use the processor time that the other workers leave. All processors
     are busy, and no simulated car is late.
     """
+
+    def __init__(self, config: pytest.Config, log: Producer) -> None:
+        super().__init__(config, log)
+        config.option.loadscopereorder = False  # `sort` has done it
+        self._scopes: dict[str, str] = {}
+        self._short: Counter[str] = Counter()
+
+    def _split_scope(self, nodeid: str) -> str:
+        """Return the work unit of a test."""
+        if nodeid not in self._scopes:  # pytest-xdist asks in the order of the tests
+            scope: str = super()._split_scope(nodeid)
+            if scope == nodeid and computes(nodeid) and not nodeid.startswith(_LONG):
+                file, _, _ = nodeid.partition("::")
+                scope = f"{file} {self._short[file] // _ASSIGNED_TOGETHER}"
+                self._short[file] += 1
+            self._scopes[nodeid] = scope
+        return self._scopes[nodeid]
 
     def _assign_work_unit(self, node: WorkerController) -> None:
         if in_background(node.gateway.id, self.numnodes, len(self.collection or ())):
