@@ -71,7 +71,10 @@ class Outcome:
 
     @property
     def code(self) -> str:
-        """Why it was not carried out: the reason, `no_answer` or `no_result`. Empty if it was carried out."""
+        """Why it was not carried out: the reason, else the phase in which it ended, `no_answer` or `no_result`.
+
+        Empty if it was carried out.
+        """
         if self.ok or self.reason:
             return self.reason
         return self.phase if self.phase in (NO_ANSWER, *_FAILED_PHASES) else NO_RESULT
@@ -85,7 +88,7 @@ class Outcome:
     def __str__(self) -> str:
         text = self.effect or self.words or self.phase
         if self.ok and self.basis == Basis.SENT and self.worst_case_s is not None:
-            at_most_s = math.ceil(round(self.worst_case_s * 10, 6)) / 10  # rounded down, it would be no maximum
+            at_most_s = math.ceil(round(self.worst_case_s * 10, 6)) / 10  # a maximum is rounded up
             text += f"; motors off within {at_most_s:.1f} s if the frames arrived"
         if self.next_step:
             text += f". {self.next_step}"
@@ -135,6 +138,7 @@ class Progress:
         self._gone_at: float | None = None
         self._is_supervised = False
         self._foreign = ""
+        """The text about another program that answered."""
         self._unanswered = ""
         """Why the last query of a stop ended without an answer."""
         self._bus_lost_until: float | None = None
@@ -152,7 +156,7 @@ class Progress:
 
     @property
     def _joined(self) -> bool:
-        """True if the command extends a running drive. The end of the drive is then recorded under the earlier id.
+        """True if the command extends a running drive. Then no event of this command says when the drive ends.
 
         A drive that begins is queued before it is sent, an extension is not.
         """
@@ -252,13 +256,13 @@ class Progress:
     def on_query_timeout(self, at: float) -> None:
         """Give up if the query has timed out without an answer."""
         late = f"no answer after {at - self._asked_at:.0f} s"
-        words = (
-            f"It is unknown what {self.car} does: its gateway is overloaded or hangs ({late}). Look at the car."
-            if self._gone_at is None
-            else f"{self.car} may be moving: its gateway is gone ({late}). Look at the car."
-        )
-        if self._gone_at is None or not self._is_supervised:
-            self._give_up_unanswered(words, at)
+        if self._gone_at is None:
+            words = f"It is unknown what {self.car} does: its gateway is overloaded or hangs ({late}). Look at the car."
+        elif self._is_supervised:
+            return  # a new gateway may still answer
+        else:
+            words = f"{self.car} may be moving: its gateway is gone ({late}). Look at the car."
+        self._give_up_unanswered(words, at)
 
     def on_presence(self, at: float, *, alive: bool) -> None:
         """Note that the gateway's token came back, or disappeared (the gateway was killed or lost its bus)."""
@@ -301,7 +305,8 @@ class Progress:
             self.waits = words or self.waits
         elif phase != Phase.ASKED:
             self.waits = ""
-        if self._phase not in (Phase.SENT, Phase.COMPLETE) or phase not in (Phase.ASKED, Phase.QUEUED):
+        was_overtaken = phase in (Phase.ASKED, Phase.QUEUED) and self._phase in (Phase.SENT, Phase.COMPLETE)
+        if not was_overtaken:
             self._phase = phase
         if phase in _FAILED_PHASES:
             self._end(phase, reason, words, at, ok=False)
@@ -323,8 +328,7 @@ class Progress:
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
             is_in_force = ok or reason == Reason.NOT_SHOWN  # an e-stop that no reading shows is in force, too
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if is_in_force else ""
-            # When a command was carried out, the gateway's words are often empty, and the effect already contains them.
-            # So the effect comes first.
+            # The effect of a command that was carried out contains the gateway's words, if there are any.
             told = (effect or words) if ok else (words or effect)
             told = told or f"{self._verb or 'command'} {phase}"
             self.outcome = Outcome(
