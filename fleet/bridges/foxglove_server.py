@@ -178,9 +178,9 @@ class FoxgloveServer:
             del self._topics[number]
             old = self._channels[topic]
             schema = old.schema()
-            old.close()  # else the SDK would give us the same one
+            old.close()  # else the SDK would not create a new channel
             self._channels[topic] = self._open(topic, schema)
-            self._repeat_last(topic)  # a client that has just subscribed got it on the old channel, if at all
+            self._repeat_last(topic)  # clients of the new channel may not have it yet
 
     def _on_subscribe(self, client: Client, channel: ChannelView) -> None:
         """Send the last message to a client that subscribes to states or events. Runs on a thread of the SDK."""

@@ -42,8 +42,8 @@ _END_TIMEOUT_S: Final = 5.0
 _FIRST_RETRY_S: Final = 0.5
 _LONGEST_RETRY_S: Final = 10.0
 _MAX_INCOMING: Final = 1024
-"""Maximum number of unread messages from the broker. They say which cars an earlier bridge left as available, and when
-Home Assistant has started."""
+"""Maximum number of unread messages from the broker. They say which cars have the availability `online` from an earlier
+bridge, and when Home Assistant has started."""
 _REFUSED: Final = frozenset({4, 5, 134, 135})
 """Codes with which a broker refuses the user or the password, in MQTT 3.1.1 and 5."""
 
@@ -90,7 +90,7 @@ class MqttBridge:
         ended = asyncio.Event()
         signals.calls_in(asyncio.get_running_loop(), lambda _: ended.set())
         with ThreadPoolExecutor(max_workers=4) as pool:
-            hearing = asyncio.create_task(self._hear(pool))
+            hearing = asyncio.create_task(self._read_bus(pool))
             publishing = asyncio.create_task(self._connect(ended))
             waiting = asyncio.create_task(ended.wait())
             try:
@@ -107,7 +107,7 @@ class MqttBridge:
 
     # ------------------------------------------------------------------ the bus
 
-    async def _hear(self, pool: ThreadPoolExecutor) -> None:
+    async def _read_bus(self, pool: ThreadPoolExecutor) -> None:
         loop = asyncio.get_running_loop()
         while True:
             heard = await loop.run_in_executor(pool, self._inbox.hear, _WAIT_S, pool)
@@ -156,7 +156,7 @@ class MqttBridge:
 
     async def _publish(self, client: aiomqtt.Client, ended: asyncio.Event) -> None:
         """Publish news over one connection until it breaks, or until the end."""
-        tasks = [asyncio.create_task(each) for each in (self._tell(client), self._listen(client), ended.wait())]
+        tasks = [asyncio.create_task(each) for each in (self._send_news(client), self._answer(client), ended.wait())]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for each in done:
@@ -166,8 +166,8 @@ class MqttBridge:
                 each.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         # If there are unread bytes when we close the connection, it is reset, which looks like a crash to the broker.
-        # So unsubscribe first. A broker that hangs does not answer. Then do not wait for it (qos 0): later it reads the
-        # last messages, or publishes our last will.
+        # So unsubscribe first. If the broker hangs, send the last messages without waiting for it (qos 0). Either it
+        # reads them later, or it publishes our last will.
         qos = 1
         try:
             await client.unsubscribe([self._home.availabilities, self._home.birth], timeout=_FAREWELL_TIMEOUT_S)
@@ -175,14 +175,14 @@ class MqttBridge:
             qos = 0
         await _send(client, self._home.end(), qos)
 
-    async def _tell(self, client: aiomqtt.Client) -> None:
+    async def _send_news(self, client: aiomqtt.Client) -> None:
         await client.subscribe([(self._home.availabilities, 1), (self._home.birth, 1)])
         await _send(client, self._home.begin())
         while True:
             await _send(client, self._home.news(self._cars(), time.monotonic()))
             await asyncio.sleep(_WAIT_S)
 
-    async def _listen(self, client: aiomqtt.Client) -> None:
+    async def _answer(self, client: aiomqtt.Client) -> None:
         async for message in client.messages:
             topic, payload = str(message.topic), message.payload
             if topic == self._home.birth:
@@ -192,7 +192,7 @@ class MqttBridge:
                 await _send(client, self._home.adopt(topic, payload))
 
     def _cars(self) -> dict[str, CarState]:
-        """Return the confirmed cars, with the newest messages about them."""
+        """Return the cars that are known, with the newest messages about them."""
         return {
             car: state
             for car in self._observer.snapshot(()).cars
