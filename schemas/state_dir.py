@@ -11,7 +11,7 @@ STATE_VARIABLE: Final = "FLEET_STATE_DIR"
 JOINED_FILE: Final = "endpoint"
 """File in the state directory that names the joined hub."""
 _LOCALHOST: Final = re.compile(r"(?<=/)localhost(?=:)")
-_NO_NAME: Final = re.compile(r"[^a-z0-9.]+")
+_NOT_IN_NAME: Final = re.compile(r"[^a-z0-9.]+")
 _NAME_LENGTH: Final = 64
 _HASH_LENGTH: Final = 8
 
@@ -44,7 +44,7 @@ def directory_of(endpoint: str, directory: Path | None = None) -> Path:
     if endpoint == DEFAULT_ENDPOINT:
         return directory
     # The hash distinguishes endpoints with the same readable part, such as [::1] and a host named 1.
-    readable = _NO_NAME.sub("-", endpoint)[:_NAME_LENGTH]
-    import hashlib  # 3 ms, which a gateway's token would wait for
+    readable = _NOT_IN_NAME.sub("-", endpoint)[:_NAME_LENGTH]
+    import hashlib  # here, because the import takes 3 ms, which would delay a gateway's token
 
     return directory / "buses" / f"{readable}-{hashlib.sha256(endpoint.encode()).hexdigest()[:_HASH_LENGTH]}"

@@ -18,10 +18,10 @@ from schemas.links import TcpUrl
 # A vanished peer is noticed within about five seconds, where the system has these options.
 _KEEPALIVE: Final = (("TCP_KEEPIDLE", 3), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 5000))
 
-SAID_WITHIN_S: Final = 3.0
+REJECTED_WITHIN_S: Final = 3.0
 """Time within which a bridge that already has a client closes a new connection. It may send a text before that, which
 says why. If a connection lasts longer, all its bytes come from a car."""
-MAX_SAID_BYTES: Final = 120
+MAX_QUOTE_BYTES: Final = 120
 """Maximum length of the quote from a bridge in an error message, bytes."""
 
 _Addresses = list[tuple[int, Any]]
@@ -102,8 +102,8 @@ class TcpLink(asyncio.Protocol, BufferedLink):
 
     def data_received(self, data: bytes) -> None:
         """Buffer bytes for `read`, and pause the socket if the buffer is full."""
-        if len(self._first) <= MAX_SAID_BYTES:
-            self._first += data[: MAX_SAID_BYTES + 1]
+        if len(self._first) <= MAX_QUOTE_BYTES:
+            self._first += data[: MAX_QUOTE_BYTES + 1]
         self._data += data
         self._came.set()
         if len(self._data) > MAX_BUFFERED_BYTES and not self._paused and self._transport is not None:
@@ -114,7 +114,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         """Store why the connection ended."""
         why = "the car closed it" if exc is None else _cause(exc)
         # A car serves one client and rejects the next. A bridge, such as ser2net, often says why before it closes.
-        is_early = time.monotonic() - self._made_at < SAID_WITHIN_S
+        is_early = time.monotonic() - self._made_at < REJECTED_WITHIN_S
         said = _bridge_text(self._first) if is_early else ""
         peer_closed = exc is None or isinstance(exc, ConnectionResetError)
         if peer_closed and (said or not self._first):
@@ -132,13 +132,13 @@ def _bridge_text(data: bytes) -> str:
     if b"$" in data or text.startswith("{") or 2 * printed < len(text):  # frames, JSON, or no text
         return ""
     shown = "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
-    return shown[:MAX_SAID_BYTES] + ("..." if len(shown) > MAX_SAID_BYTES else "")
+    return shown[:MAX_QUOTE_BYTES] + ("..." if len(shown) > MAX_QUOTE_BYTES else "")
 
 
 class TcpKind(LinkKind[TcpUrl]):
     """Opens TCP links."""
 
-    async def open(self, url: TcpUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no car waits
+    async def open(self, url: TcpUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - there is no queue
         """Connect. Raises CannotOpen if nobody answers."""
         try:
             async with asyncio.timeout(timeout_s):
@@ -163,7 +163,7 @@ KIND: Final = TcpKind()
 async def _look_up(url: TcpUrl) -> _Addresses:
     """Return the addresses of the host. Raises the errors of getaddrinfo."""
     # If the name server is silent, getaddrinfo blocks for a minute and cannot be cancelled. So run it in a daemon
-    # thread. (Before the process ends, it would wait for a thread of the loop.) All attempts share one lookup.
+    # thread. A thread of the loop would keep the process alive for that minute. All attempts share one lookup.
     found = _lookups.get(url)
     if found is None or found.done():
         found = Future()
