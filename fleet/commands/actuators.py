@@ -20,7 +20,7 @@ from fleet.client.commands import (
     speed_request,
 )
 from fleet.commands.options import carry_out, json_option, take_option, with_client
-from fleet.commands.params import CarNames, Choice, Color, Duration, cars_argument, describe_missing_words
+from fleet.commands.params import CarNames, Choice, Color, Duration, cars_argument, describe_usage
 from schemas.commands import COMMANDS, CommandType
 from schemas.suggestion import misspelled
 from schemas.words import FanState, Light, Servo, SpeedStep
@@ -63,7 +63,7 @@ def _arm(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tupl
     """Split the words into cars and six joints. Return the cars and the request."""
     cars, joints = words[:-6] or words[:1], words[-6:] if len(words) > 6 else words[1:]
     if not words:
-        raise click.UsageError(describe_missing_words(ctx), ctx)
+        raise click.UsageError(describe_usage(ctx), ctx)
     needed = f"6 are needed, 0 to 180 degrees each, as: {_ARM_EXAMPLE}"
     if len(cars) > 1 and any(each.isdigit() for each in cars):  # a number among the cars is more likely a seventh joint
         cars, joints = words[:1], words[1:]
@@ -80,7 +80,7 @@ def _fan(ctx: click.Context, _: click.Parameter, words: tuple[str, ...]) -> tupl
     state = words[-1] if len(words) > 1 and words[-1] in tuple(FanState) else None
     cars = words[:-1] if state else words
     if not cars:
-        raise click.UsageError(describe_missing_words(ctx), ctx)
+        raise click.UsageError(describe_usage(ctx), ctx)
     return _names(ctx, cars), fan_request(state)
 
 

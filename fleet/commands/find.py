@@ -99,7 +99,9 @@ def find(
         raise click.exceptions.Exit(1)
     if not found:
         most_s = max((answer.longest_s for _, answer in answers), default=-1.0)
-        how_long = "" if most_s < 0 else f" for {time_spec.words(for_s or 0.0)}, but for {time_spec.words(most_s)}"
+        how_long = ""
+        if most_s >= 0:
+            how_long = f" for {time_spec.words(for_s or 0.0)}, but for {time_spec.words(most_s)} at most,"
         after = f" since {since}" if since is not None else ""
         raise click.ClickException(f"{expression} was never true{how_long} in the sessions in {place}{after}.")
 
@@ -144,12 +146,12 @@ def _mark_sessions(found: list[tuple[Path, "Hit"]], expression: "Expression") ->
     for path, hit in found:
         hits.setdefault(path, []).append(hit)
     are_marked = True
-    for path, of_session in hits.items():
-        count = "1 hit" if len(of_session) == 1 else f"{len(of_session)} hits"
-        text = f"{expression}: {of_session[0].car}, {count}"[:MAX_MARK_CHARACTERS]
+    for path, hits_here in hits.items():
+        count = "1 hit" if len(hits_here) == 1 else f"{len(hits_here)} hits"
+        text = f"{expression}: {hits_here[0].car}, {count}"[:MAX_MARK_CHARACTERS]
         try:
             # The author is only the person, without host and process. So the same search recognizes its mark tomorrow.
-            add_mark(path, of_session[0].begin_ns, text, keys.person_of(default_sender(chosen_person())))
+            add_mark(path, hits_here[0].begin_ns, text, keys.person_of(default_sender(chosen_person())))
         except (NoMark, OSError) as error:
             words = error.strerror if isinstance(error, OSError) else error
             echo_safely(f"{path.name}: not marked: {words}", err=True)

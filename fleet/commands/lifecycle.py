@@ -79,17 +79,19 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
 
 
 def _warning_of_recorder(bus: Bus, fleet: str) -> str:
-    """Return the recorder's warning, such as that marked sessions exceed the quota. Empty if there is none."""
+    """Return the recorder's warning, for example that marked sessions exceed the quota. Empty if there is none."""
     found = ask_recorder(bus, fleet, RecorderVerb.STATUS)
     return "" if found is None or isinstance(found, Failure) else str(found.warning)
 
 
 def _describe_process(process: Any) -> str:
     pid = f"process {process.pid}" if process.HasField("pid") else "no process"
-    times = "once" if process.restarts == 1 else f"{process.restarts} times"
-    again = f", started again {times}: {process.words}" if process.restarts else ""
-    why = f": {process.words}" if process.words and not process.restarts else ""
-    return f"  {process.name:14} {process.state:9} {process.since_s:6.0f} s  {pid}{again}{why}"
+    if process.restarts:
+        times = "once" if process.restarts == 1 else f"{process.restarts} times"
+        why = f", started again {times}: {process.words}"
+    else:
+        why = f": {process.words}" if process.words else ""
+    return f"  {process.name:14} {process.state:9} {process.since_s:6.0f} s  {pid}{why}"
 
 
 @click.command(epilog="\b\nexample:\n  fleet down")
@@ -218,14 +220,14 @@ def _log_directory(connect: str | None, fleet: str) -> Path:
                 if Path(each.directory).is_dir():
                     return Path(each.directory)
     except BusError:
-        pass  # nothing runs, but the logs are files
+        pass  # no fleet runs, but the files of its last run may be here
     return _last_run(connect, fleet)
 
 
 def _last_run(connect: str | None, fleet: str) -> Path:
     """Return the log directory of the last run on this machine."""
     place = runs_directory(fleet, resolve_endpoint(connect))
-    # A run that was refused has no logs.
+    # If `fleet up` refused to start anything, its directory has no logs.
     runs = sorted(each for each in place.iterdir() if any(each.glob("*.log"))) if place.is_dir() else []
     if not runs:
         raise click.ClickException(f"No logs yet: {keys.describe_fleet(fleet)} has not run here. `fleet up` starts it.")

@@ -72,10 +72,10 @@ _MAX_SHORTFALL_LINES: Final = 5
 @json_option
 @with_client
 def list_cars(client: Fleet, cars: Sequence[str], *, as_json: bool) -> None:
-    """List cars: link, readiness, mode, motors with the basis of that claim, who is in control, battery.
+    """List cars: link, readiness, mode, motors and how that is known, who is in control, battery.
 
-    SHOWS STOPS says whether the car's reports show that a stop arrived. A car that cannot show this drives and stops
-    like any other. On a narrow terminal, some columns are left out, such as platform, shows stops and verdict. --json
+    SHOWS STOPS says whether the car's reports show that a stop arrived. All cars drive and stop alike, with or without
+    such reports. On a narrow terminal, some columns are left out, such as platform, shows stops and verdict. --json
     prints all of them.
     """
     show_cars(client, resolve_cars(client, cars), as_json=as_json)
@@ -246,7 +246,7 @@ def get(
         raise click.UsageError("--csv and --json exclude each other: give one of them")
     if as_csv and len(matched) != 1:
         meant = ", ".join(topic.name for topic in matched) or "no message"
-        raise click.UsageError(f"--csv needs one message type, but {key_expression} means {meant}.")
+        raise click.UsageError(f"--csv needs one message type, but {key_expression} matches {meant}.")
     past = last is not None or since is not None
     why_not = history_query.describe_missing_history(matched) if past else ""
     if why_not:
@@ -347,9 +347,9 @@ def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str
             raise click.ClickException(describe_missing(client, expressions[0], f"no key {what} is published now"))
     if as_json:
         for each in found:
-            click.echo(json.dumps(_row(each)))
+            click.echo(json.dumps(_key_row(each)))
     else:
-        show_table(_KEY_COLUMNS, [_cells(each) for each in found])
+        show_table(_KEY_COLUMNS, [_key_cells(each) for each in found])
 
 
 def _survey(client: Fleet, expressions: Sequence[str], look_s: float) -> list[KeyInfo]:
@@ -378,7 +378,7 @@ def _survey(client: Fleet, expressions: Sequence[str], look_s: float) -> list[Ke
     return survey.keys(silent, datetime.now(UTC))
 
 
-def _row(info: KeyInfo) -> dict[str, Any]:
+def _key_row(info: KeyInfo) -> dict[str, Any]:
     topic = info.topic
     return {
         "key": info.key,
@@ -391,7 +391,7 @@ def _row(info: KeyInfo) -> dict[str, Any]:
     }
 
 
-def _cells(info: KeyInfo) -> dict[str, str]:
+def _key_cells(info: KeyInfo) -> dict[str, str]:
     stale = " (stale)" if info.stale else ""
     return {
         "key": info.key,
@@ -437,7 +437,7 @@ def wait(
     connect: str | None,
     fleet: str,
 ) -> None:
-    """Wait until CONDITION is true for a reading of KEY, and print it. The latest reading counts, unless it is stale.
+    """Wait until CONDITION is true for a reading of KEY, and print it. The latest one will do, unless it is stale.
 
     If KEY has a wildcard, one matching key is enough. CONDITION is written as for `fleet watch --when`. With --ready,
     wait for cars instead. A car is ready when its link is open and the state of its motors is known.

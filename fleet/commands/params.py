@@ -108,13 +108,14 @@ class Choice(click.Choice[str]):
 
     def get_invalid_choice_message(self, value: Any, ctx: click.Context | None) -> str:
         """Return the error text, with the likely word, or with all words if none is likely."""
-        near = self._hints.get(value) or did_you_mean(str(value), self.choices)
-        if ctx is not None and set(ctx.params.get("cars", ())) & set(self.choices):
-            near = f"Write the {self._what} last."
         if self._what == "motion" and duration_s(str(value)) is not None:
-            near = f"Write how long as: --for {value}"
-        all_of_them = f"Choose from: {', '.join(self.choices)}."
-        return f'"{value}" is not a {self._what}. {near or all_of_them}'
+            hint = f"Write the duration as --for {value}."
+        elif ctx is not None and set(ctx.params.get("cars", ())) & set(self.choices):
+            hint = f"Write the {self._what} last."
+        else:
+            hint = self._hints.get(value) or did_you_mean(str(value), self.choices)
+            hint = hint or f"Choose from: {', '.join(self.choices)}."
+        return f'"{value}" is not a {self._what}. {hint}'
 
 
 class CarNames(click.ParamType[tuple[str, ...]]):
@@ -228,19 +229,19 @@ class SessionPath(click.ParamType[Path]):
 
 
 def _flat(_: click.Context, __: click.Parameter, value: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
-    """Join `red,blue` and `green`."""
+    """Return the names in all arguments, such as `red,blue` and `green`, each once."""
     return tuple(dict.fromkeys(name for names in value for name in names))
 
 
 def _require_cars(ctx: click.Context, param: click.Parameter, value: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
-    """Join `red,blue` and `green`. Fail with an example if no car is named."""
+    """Return the names in all arguments, each once. Fail with an example if no car is named."""
     if not value:
-        raise click.UsageError(describe_missing_words(ctx), ctx)
+        raise click.UsageError(describe_usage(ctx), ctx)
     return _flat(ctx, param, value)
 
 
-def describe_missing_words(ctx: click.Context) -> str:
-    """Return the error text for missing words: what to write, with the first example of the command."""
+def describe_usage(ctx: click.Context) -> str:
+    """Return the error text for missing arguments: what to write, with the first example of the command."""
     pieces = [each for each in ctx.command.collect_usage_pieces(ctx) if each != "[OPTIONS]"]
     example = next(line.strip() for line in (ctx.command.epilog or "").splitlines() if line.startswith("  fleet"))
     return f"Write: {ctx.command_path} {' '.join(pieces)}, such as: {example}"
@@ -323,7 +324,7 @@ def _file_here() -> "FleetFile | None":
     if Path("fleet.yaml").is_file():
         from fleet.fleetfile.fleet_file import read_fleet
 
-        with suppress(ValueError):  # a BadFile
+        with suppress(ValueError):  # BadFile is a ValueError
             return read_fleet(Path("fleet.yaml"), unbound=True)
     return None
 

@@ -44,14 +44,14 @@ a plan:
 @click.option(
     "--fleet-file",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Read the cars' capabilities and roles in this fleet file.",
+    help="Read the cars and the people from this fleet file.",
 )
 @click.option(
     "--run",
     "run_name",
     default="",
     metavar="NAME",
-    help="Name of the run of `fleet up`. Within a run, phase and rules survive a restart of the coordinator.",
+    help="Name of the run of `fleet up`. A restarted coordinator continues the phase and the rules of the same run.",
 )
 @starter_option()
 @json_option

@@ -53,7 +53,7 @@ Look at it with `fleet list --fleet fleet-replay`, or run your own program on it
     "--skip-gaps",
     "skip_gaps_s",
     type=Duration(_DAY_S),
-    help="Shorten each longer gap between messages to DURATION, such as 5s.",
+    help="Maximum gap between messages, such as 5s. Longer gaps are shortened.",
 )
 @click.option(
     "--cars-only", is_flag=True, help="Leave out the messages of the coordinator, the recorder and the supervisor."
@@ -165,7 +165,7 @@ def play(
 
 
 def _with_start_at(recorded: Iterable["Recorded"], from_ns: int | None, schedule: Any) -> Iterator["Recorded"]:
-    """Start the schedule at `from_ns`, so that the time until the first message counts."""
+    """Start the schedule at `from_ns`, so that the player also waits for the first message."""
     if from_ns is not None:
         schedule.due_s(from_ns)
     yield from recorded

@@ -250,7 +250,7 @@ def _pins_and_people(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Cal
     try:
         # Only the rules count here: cars without a link, or a plan that is not beside the file, do no harm.
         return read_fleet(fleet_file, unbound=True, moved=True).pins, people
-    except ValueError as error:  # a BadFile
+    except ValueError as error:  # BadFile is a ValueError
         _warn(f"no condition under pin: in {fleet_file} is pinned: {error}")
         return (), people
 

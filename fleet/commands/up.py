@@ -134,7 +134,7 @@ def up(
 
             listen_or_fail(spec.console_port or None, "fleet up --console-port {other}").close()
         endpoint = resolve_endpoint(spec.endpoint)
-        if not accepts(endpoint):  # the hub will be ours
+        if not accepts(endpoint):  # then this `fleet up` starts the hub
             check_listening(endpoint, insecure_lan=insecure_lan)
         if spec.record and (why := Reserve().why_unwritable(spec.recordings)):
             raise click.ClickException(
@@ -173,7 +173,7 @@ def _with_certificates(spec: FleetSpec, *, secure: bool) -> FleetSpec:
     from fleet.hub import local_hub  # needs an extra
 
     if secure and not is_secure(endpoint):
-        if not spec.endpoint and os.environ.get(ENDPOINT_VARIABLE):  # the next command would use that bus
+        if not spec.endpoint and os.environ.get(ENDPOINT_VARIABLE):  # all other commands would use that bus
             raise click.UsageError(f"{ENDPOINT_VARIABLE} names a bus without certificates, {endpoint}: unset it")
         endpoint = f"tls/{endpoint.partition('/')[2]}"
     if secure or local_hub.is_hub_here(endpoint):
@@ -187,9 +187,8 @@ def _with_certificates(spec: FleetSpec, *, secure: bool) -> FleetSpec:
 def _with_plan(spec: FleetSpec, text: str) -> FleetSpec:
     """Return the spec with this plan. Raises ValueError, which names everything in the plan that can never work."""
     plan = parse_plan(text, str(spec.plan))
-    cars = listed_cars(
-        parse_fleet(coordinator_fleet_file(spec), Path("fleet.yaml"), unbound=True)
-    )  # as the coordinator will
+    # The coordinator reads the cars in the same way.
+    cars = listed_cars(parse_fleet(coordinator_fleet_file(spec), Path("fleet.yaml"), unbound=True))
     found = find_faults(plan, cars)
     found.raise_errors(str(spec.plan))
     return replace(
