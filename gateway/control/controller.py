@@ -419,7 +419,7 @@ class Controller(Generic[D_co]):
         match command.what:
             case Drive(duration_s=duration_s):
                 lasts_s = self._busy_s(now) + duration_s
-            case SetMode(mode):  # until the mode is open
+            case SetMode(mode):  # the lease lasts until the mode is open
                 opening_s = 0.0 if mode is Mode.MANUAL else self.driver.opening_s(mode)
                 lasts_s = self._busy_s(now) + opening_s
             case _:  # other commands do not shorten the lease of a drive

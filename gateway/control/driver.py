@@ -46,7 +46,7 @@ STALL_S: Final = 0.5
 """Maximum gap of the loop during a held motion. After a longer one the gateway stops the car
 (docs/explanation/how-it-works.md#processes-and-threads)."""
 LATE_DRIVE_S: Final = 0.1
-"""If a drive begins later than this, its sender is told how long it waited."""
+"""A drive may begin this long after its request. If it begins later, its sender is told how long it waited."""
 MOVED_CM: Final = 5.0
 """Minimum change of the distance that counts as a movement. At rest, readings differ by up to a centimeter."""
 
@@ -178,7 +178,7 @@ class DriverClaims(Protocol):
 
     @property
     def known(self) -> bool:
-        """True if the car reads frames as they are meant: after its first stop, until a write fails."""
+        """True if nothing is in doubt since the first stop of the car, so that it reads frames as they are meant."""
 
     @property
     def at_rest(self) -> bool:
@@ -368,7 +368,7 @@ class Driver(ABC):
 
     def stop_after_sleep(self, now: float) -> None:
         """Stop the car. A stop that began before the sleep continues."""
-        if not self.shutting_down or self.is_stopping:
+        if not self.shutting_down or self.is_stopping:  # nothing follows the last stop of a gateway that ends
             self.stop(FrameOrigin.STOP, now)
 
     # ------------------------------------------------------------------ frames out
@@ -416,7 +416,7 @@ class Driver(ABC):
         return ""
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return how long a mode waits at most before its frame is written, s. A motion would wait for `busy_s`."""
+        """Return how long a mode waits at most before its frame is written, s. `busy_s` is the same for a motion."""
         del now
         return busy_s
 
@@ -487,7 +487,7 @@ class Driver(ABC):
 
     @property
     def opened_as(self) -> str:
-        """Return what the next gateway must know to stop the car. A change is saved at once."""
+        """Return what the next gateway must know to end a mode, such as the platform. A change is saved at once."""
         return ""
 
     # ------------------------------------------------------------------ the same for every family
@@ -505,7 +505,10 @@ class Driver(ABC):
             self.stop_if_open(now)
 
     def halt(self, words: str, now: float, by: str = "") -> None:
-        """Drop all queued commands. Refuse a running stream of drives until its sender has been silent."""
+        """Drop all commands, and refuse each sender that has just driven until it has been silent. Shorten the lease.
+
+        `by` is the sender of the stop. It is refused only if it streams: a script may stop and drive again.
+        """
         self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self.safety.shorten_lease(now)
         self.senders.halt(now, by)
@@ -516,7 +519,7 @@ class Driver(ABC):
         If the distance has changed, add that to the record. It is no proof: something in front may have moved.
         """
         held, model = self.queue.held, self.model
-        if held is None or held.began_at is None:
+        if held is None or held.began_at is None:  # the frame of the drive was not written
             self.queue.close_held(Phase.COMPLETE, None, words, now)
             return
         sent = f"sent for {now - held.began_at:.1f} s"
