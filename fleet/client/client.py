@@ -72,14 +72,14 @@ command_log = logging.getLogger(json_log.COMMANDS)
 
 
 def default_sender(person: str | None = None) -> str:
-    """Return the default sender, one key chunk: person@host-pid. The person is FLEET_AS, else the user's login.
+    """Return the default name of a sender: person@host-pid. The person is FLEET_AS, else the user's login.
 
     Raises keys.BadKey for a bad name of a person.
     """
     person = person or os.environ.get("FLEET_AS")
     try:
         user = keys.check_name(person, "person") if person else getpass.getuser()
-    except (KeyError, OSError, ImportError):  # no entry for this user id, as in some containers; no pwd (Windows)
+    except (KeyError, OSError, ImportError):  # a container without this user id, or Windows, which has no pwd
         user = "user"
     return re.sub(r"[^A-Za-z0-9_.@-]", "-", f"{user}@{socket.gethostname()}-{os.getpid()}").lstrip("@")
 
@@ -263,7 +263,7 @@ class Fleet:
         return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until the condition `when` is true for a reading, and return it. The current reading counts, too.
+        """Wait until the condition `when` is true for a reading, and return it. The current reading may be the one.
 
         With `for_s`, the condition must have been true in all readings of this time, by their stamps. Without
         `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
@@ -366,7 +366,7 @@ class Fleet:
     def send(self, request: CommandRequest, cars: Iterable[str] | None = None) -> PendingCommand:
         """Send a command and return at once. To get its outcomes, pass the result to `outcomes`."""
         self._check_open()
-        cars = [cars] if isinstance(cars, str) else cars  # a str is an iterable of letters
+        cars = [cars] if isinstance(cars, str) else cars  # "red" is an Iterable[str], too: r, e, d
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._fill(request)
         payload = message.SerializeToString()
@@ -397,7 +397,7 @@ class Fleet:
             command.wait()
             for query in command.queries:
                 if query.done() and not query.cancelled():
-                    query.result()
+                    query.result()  # raises an unexpected error of its thread
         finally:
             self._pending.pop(command.id, None)
         found = command.outcomes()
@@ -438,7 +438,7 @@ class Fleet:
                 if isinstance(answer, Sample):
                     command.inbox.put((time.monotonic(), answer))
                 else:
-                    why_silent = "" if answer.words == "Timeout" else answer.words
+                    why_silent = "" if answer.words == "Timeout" else answer.words  # see QueryEnded
         finally:
             command.inbox.put((time.monotonic(), QueryEnded(target, why_silent)))
 

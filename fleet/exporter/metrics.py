@@ -129,7 +129,7 @@ CAR_METRICS: Final = (
     ),
     CarMetric(
         "fleet_car_ready",
-        "1 if the car answers, and a command to it waits for nothing",
+        "1 if the car answers, and a command to it need not wait",
         Unit.YES_NO,
         panel="Ready",
         values=lambda state, now: [((), float(state.why_not_ready(now) is None))],
@@ -293,7 +293,7 @@ _RECORDER: Final[tuple[tuple[Metric, Callable[[Any], Values]], ...]] = (
     (
         Metric(
             "fleet_recorder",
-            "1 for the state of the recorder, 0 for the others; no value: no recorder",
+            "1 for the state of the recorder, 0 for the others, no value without a recorder",
             labels=("state",),
             panel="Recorder",
         ),

@@ -305,7 +305,7 @@ class Session:
         return arrow_table(self.rows(self.selection(of, start_ns, end_ns)), of, self.name)
 
     def stray_tables(self, *, start_ns: int | None = None, end_ns: int | None = None) -> "dict[str, pa.Table]":
-        """Return the messages that have another type than their key calls for, one pyarrow.Table for each type.
+        """Return the messages whose type does not fit their key, one pyarrow.Table for each type.
 
         The names are such as `stray.fleet.v1.Range`, and `other` for messages that are not protobuf. `start_ns` and
         `end_ns` are as for `messages`. Raises FormatMissing without the extra `analysis`.
