@@ -69,7 +69,7 @@ class Writer:
                 now = self._loop.time()
                 self._publisher.publish_frame(write, now, whole=False)
                 self._driver.link_down(reason, now, cause=Reason.WRITE_FAILED)
-                if self._link.link is link:  # else `keep_open` has noticed the loss already
+                if self._link.link is link:  # `keep_open` may have noticed the loss first
                     self._link.lost(reason)
                 await link.close()  # `keep_open` wakes and reopens it
                 return

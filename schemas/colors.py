@@ -16,6 +16,7 @@ COLORS: Final[Mapping[str, Rgb]] = {
 }  # fmt: skip
 COLOR_PATTERN: Final = f"^({'|'.join(COLORS)}|#[0-9a-fA-F]{{6}})$"
 
+# For cars that are named after a color. The shades are not those of COLORS: a black car is drawn in gray.
 _CAR_COLORS: Final[Mapping[str, Rgb]] = {
     "red": (235, 80, 80), "green": (90, 200, 110), "blue": (90, 150, 250), "yellow": (235, 205, 70),
     "orange": (245, 150, 60), "white": (230, 230, 230), "black": (130, 130, 130), "pink": (245, 130, 190),
@@ -52,5 +53,5 @@ def hex_color(color: Rgb) -> str:
 
 
 def car_color(car: str, index: int) -> Rgb:
-    """Return the color of a car in every view: the one it is named after, else one by its index."""
+    """Return the color of a car in every view: the color that the car is named after, else one by its index."""
     return _CAR_COLORS.get(car, _OTHER_CAR_COLORS[index % len(_OTHER_CAR_COLORS)])

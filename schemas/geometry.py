@@ -63,7 +63,7 @@ def foot(x: float, y: float, segment: Segment) -> Point:
     x1, y1, x2, y2 = segment
     wx, wy = x2 - x1, y2 - y1
     square = wx * wx + wy * wy
-    if square == 0:  # also for a length of 1e-200
+    if square == 0:  # 0 also for lengths whose square underflows, such as 1e-200
         return x1, y1
     share = min(1.0, max(0.0, ((x - x1) * wx + (y - y1) * wy) / square))
     return x1 + share * wx, y1 + share * wy

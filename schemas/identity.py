@@ -112,7 +112,7 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
             if name == Service.COORDINATOR:
                 return is_coordinator
             if name == Service.SUPERVISOR:
-                return verb in STOPS or verb not in COMMANDS  # and the verbs of services, such as a new plan
+                return verb in STOPS or verb not in COMMANDS  # the others are verbs of services, such as a new plan
             return name == Service.CONSOLE and not is_coordinator
         case IdentityRole.SITE:
             return False  # it passes on what others send under their own identities

@@ -97,7 +97,7 @@ class CarState:
     def of_answers(cls, car: str, answers: Iterable[tuple[str, Reading]], now: float, *, present: bool) -> Self:
         """Return the state of a car by the answers to queries, with their topics. `now` is in s since the epoch."""
         state = cls(car, present)
-        for topic, reading in sorted(answers, key=lambda each: each[1].time):  # the newest gateway has the last word
+        for topic, reading in sorted(answers, key=lambda each: each[1].time):  # the newest gateway's states come last
             state.take(topic, reading.value, now - age_of_answer_s(reading.time.timestamp(), now))
         return state
 
@@ -249,7 +249,7 @@ class CarState:
             return ""
         if link.state == LinkState.LOST:
             return f"link lost: {link.reason}" if link.reason else "link lost"
-        if link.state == LinkState.STALE:  # it gets commands all the same
+        if link.state == LinkState.STALE:  # commands are still sent to such a car
             return "silent: is it switched on?"
         if safety.waits_for:
             return f"waits for {safety.waits_for}"

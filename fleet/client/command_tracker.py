@@ -23,7 +23,8 @@ SEND_AGAIN_INTERVAL_S: Final = 0.5
 BUS_LOOK_INTERVAL_S: Final = 0.1
 """Interval at which a stop without an answer checks whether the bus is there. A lost session stays lost for at least
 twice as long."""
-_MAX_QUEUED_ITEMS: Final = 4096  # answers and events of one command: a few for each of up to some hundred cars
+_MAX_QUEUED_ITEMS: Final = 4096
+"""Maximum number of unread answers and events of a command. Each of up to some hundred cars sends a few."""
 
 
 log = logging.getLogger("fleet")
@@ -138,8 +139,8 @@ class PendingCommand:
                 self._say_waits(waiting)
             for progress in waiting:
                 if now >= progress.deadline and not progress.awaits_bus and self._hubs() != self._hubs_then:
-                    progress.on_presence(now, alive=True)  # the hub was lost, not the gateway
-                if now >= progress.deadline and self.inbox.empty():  # after a stall, an answer may be queued
+                    progress.on_presence(now, alive=True)  # its gateway is not gone: our hub was lost
+                if now >= progress.deadline and self.inbox.empty():  # after a stall, its answer may be in the queue
                     progress.give_up(now)
             due = [each.deadline for each in waiting] or [now + ANSWER_TIMEOUT_S]
             if self._late_at is not None:
@@ -186,7 +187,7 @@ class PendingCommand:
             for progress in unanswered:
                 progress.on_bus_lost(now, self._asked_at + STOP_TTL_S)
             return
-        if hubs != self._hubs_then and unanswered:  # another hub, perhaps between two looks
+        if hubs != self._hubs_then and unanswered:  # the hub was replaced, perhaps between two looks
             self.lost_bus = True
         if self.lost_bus and self._bus_back_at is None:
             self._bus_back_at = now

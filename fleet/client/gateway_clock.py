@@ -2,8 +2,8 @@
 
 Answers of such a gateway look old, or from the future, and commands to it are `stale`. Stops, e-stops and pauses do not
 depend on a clock. A state that was published just now shows the difference: its stamp is by the gateway's clock, and it
-came at a time by our clock. A delay on the way makes the gateway's clock look later than it is, so the message with the
-largest lead over our clock counts. One message is not enough, because the network or a process may have delayed it.
+came at a time by our clock. After a delay on the way, the gateway's clock seems to be further behind than it is. So the
+message with the largest lead over our clock counts, and one message is not enough.
 
 A gateway that hangs publishes nothing, so nothing is known about its clock. A replay publishes old stamps at the usual
 rate, but is not a gateway: the caller must leave it out. Pure.

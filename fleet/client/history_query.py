@@ -34,7 +34,7 @@ def selector(key_expression: str, *, last: int | None = None, since_s: float | N
 def merge(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
     """Merge the readings of two answers, sorted by key and time, at most `last` of each key."""
     # If a link's queue is full, a gateway drops answers and does not block. So a client that finds gaps queries again.
-    boots: dict[str, int] = {}  # gives each boot a number in the order of their arrival, as a boot_id is random
+    boots: dict[str, int] = {}  # numbers the boots in the order of arrival, because the ids themselves are random
     found: dict[tuple[str, int, int], Reading] = {}
     for reading in (*earlier, *more):
         boot = boots.setdefault(reading.value.boot_id, len(boots))

@@ -13,7 +13,7 @@ from fleet.conditions.functions import FUNCTIONS, split_call
 from schemas import topics
 
 _MAX_ALTERNATIVES: Final = 512
-"""Maximum number of alternatives of a condition. A condition with more counts as possible."""
+"""Maximum number of alternatives of a condition. A condition with more alternatives counts as possible."""
 
 _DOMAINS: Final = {
     f"{topic.name.rpartition('/')[2]}.{name}": (topic.words.get(name, ()), topic.ranges.get(name))

@@ -481,7 +481,7 @@ class Console:
         Answer each of the waiting stops with the outcomes of its own cars.
         """
         if not (waiting := self._waiting_stops.pop(who, [])):
-            return  # an earlier call has sent these stops, because their merge was forgotten
+            return  # `_merges` forgot a merge, so there were two calls: the first one has sent these stops
 
         def answer_all(outcomes: list[dict[str, Any]]) -> None:
             for cars, answer in waiting:

@@ -80,7 +80,8 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         self._end_later()
 
     def _end_later(self) -> None:
-        self.loop.call_later(2 * CLOSE_TIMEOUT_S, self.transport.abort)  # after the answer, and the end of TLS
+        # The timeout applies twice: to the answer, and to the end of TLS.
+        self.loop.call_later(2 * CLOSE_TIMEOUT_S, self.transport.abort)
 
     def _read_again(self) -> None:
         if self._full is not None:

@@ -63,6 +63,7 @@ class LaneFeed(PageFeed):
     def _show(self, page: PageLink, back_ns: int) -> None:
         now = time.time_ns()
         if page.has_unsent("lanes"):
-            back_ns = LIVE_LANES_NS  # this message replaces one that waits, perhaps the first, which covers everything
+            # This message replaces one that the page did not get. It may have been the first, which covers everything.
+            back_ns = LIVE_LANES_NS
         spans = [span.as_list() for span in (*self._lanes.since(now - back_ns), *self._lanes.silences(now))]
         page.show("lanes", json.dumps({"t": "lanes", "spans": spans}, separators=(",", ":")))

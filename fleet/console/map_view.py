@@ -84,7 +84,7 @@ class MapView:
         if before is not None and before.frame != place.frame:
             self._trails.pop(car, None)  # the new place has another origin
         trail = self._trails.setdefault(car, deque())
-        while trail and abs(place.at - trail[0][0]) > TRAIL_S:  # or the clock was set back
+        while trail and abs(place.at - trail[0][0]) > TRAIL_S:  # `abs`, because the clock may be set back
             trail.popleft()
         if trail:
             at, x_m, y_m = trail[-1]

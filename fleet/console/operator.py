@@ -102,13 +102,10 @@ class ConsoleOperator:
         for outcome in outcomes:
             if not outcome.ok and outcome.reason != Reason.SUPERSEDED:
                 on_refusal(outcome)
-        if (
-            press.client,
-            press.id,
-        ) not in self._streams:  # our query may have overtaken the end of the press in the stream
-            driven = {
-                car for _, _, cars in self._streams.values() for car in cars
-            }  # driven by a press that has replaced this one
+        if (press.client, press.id) not in self._streams:
+            # The press has ended meanwhile. The end was sent in the stream, and our query may have overtaken it. So end
+            # the drive again, but not for cars that a newer press drives.
+            driven = {car for _, _, cars in self._streams.values() for car in cars}
             await self._ask_to_end([car for car in press.cars if car not in driven])
 
     async def _ask_to_end(self, cars: Sequence[str]) -> None:

@@ -59,7 +59,7 @@ class PageMessage:
             raise BadPageMessage(f"{name} is not a text of at most {longest} characters")
         try:
             value.encode()
-        except UnicodeEncodeError:  # half of a pair of surrogates
+        except UnicodeEncodeError:  # the text has half of a surrogate pair
             raise BadPageMessage(f"{name} has invalid characters") from None
         return value
 

@@ -113,6 +113,6 @@ def moment_question(text: str) -> dict[str, Any]:
 def _number(fields: Mapping[str, Any], name: str, most: float) -> float:
     """Return a number from 0 to `most`. Raises BadPageMessage."""
     value = fields.get(name, 0)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= most:  # NaN is not, either
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 <= value <= most:  # also for NaN
         raise BadPageMessage(f"{name} is not 0 to {most}")
     return float(value)

@@ -119,7 +119,7 @@ def samples_of(
     for each in messages:
         if is_told(each):
             buffer.add(each.key.car, each.key.topic, each.message, each.log_ns // _MS)
-    slot_ms = max(1, -(-(to_ns - from_ns) // _MS // PLOT_SLOTS))  # rounded up
+    slot_ms = max(1, -(-(to_ns - from_ns) // _MS // PLOT_SLOTS))  # the two minus signs round up
     return {
         number: list({at_ms // slot_ms: (at_ms, value) for at_ms, value in values}.values())
         for number, values in buffer.take().items()

@@ -228,7 +228,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         # afterwards.
         named = replace(stop_request(), sender=console.sender_of(person))
         console.stop_all(stop_id, console.operator_of(person), named)
-        if not await console.is_stop_taken():  # the page sends its STOP again for as long as it counts
+        if not await console.is_stop_taken():  # after this answer, the page sends its STOP again
             return JSONResponse({"ok": False, "words": STOP_NOT_TAKEN}, 503)
         return Response(status_code=204)
 
@@ -262,7 +262,7 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
                         await _carry_out_stops(socket_, text, on_text)
                         await socket_.close(SENT_TOO_MUCH, TOO_MUCH)
                         return
-                    if text:  # an empty text is a ping, which only counts
+                    if text:  # an empty text is a ping: it only uses the budget
                         on_text(text)
                     await asyncio.sleep(0)  # a page that floods must not keep the others waiting
         except TooManyPages as error:

@@ -79,7 +79,7 @@ class SessionJobs:
             try:
                 out, err = await process.communicate()
             finally:
-                if process.returncode is None:  # cancelled
+                if process.returncode is None:  # this task was cancelled
                     kill(process)
                 self._running.discard(process)
         said = err.decode("utf-8", "replace").strip().splitlines()

@@ -53,7 +53,7 @@ class SetupApi:
             try:
                 fields = PageMessage.of(await read_body(request) or "{}").fields
                 return JSONResponse({"ok": True, **await asyncio.to_thread(work, fields)})
-            except (ValueError, ScanFailed, OSError) as error:  # BadFile and CannotEdit are among them
+            except (ValueError, ScanFailed, OSError) as error:  # BadFile and CannotEdit are ValueErrors
                 return refuse(str(error))
 
         async def alone(request: Request) -> Response:

@@ -116,7 +116,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     free = tuple(car for car in subjects if car not in barriers)
     cars = CarSets(subjects, frozenset(free), frozenset({*free, *gone_lately}), roles_before)
     phase = memory.phase
-    # The first phase begins before the rules are evaluated, because some rules count only in this phase.
+    # The first phase begins before the rules are evaluated, because some rules apply only in this phase.
     if not phase.name:
         phase = follow_phase(plan, snapshot, cars, phase, {}, now, ready=False)
     rules = follow_rules(plan, snapshot, cars, phase.name, memory.rules, now)
@@ -269,7 +269,7 @@ def _may_be_free_soon(known: CarSnapshot, barrier: Barrier) -> bool:
 
 def _is_in_decided_mode(known: CarSnapshot, last: Decision | None) -> bool:
     """Return True if a car is in the mode that was last decided for it, or needs none. False if it was left alone."""
-    if last is None or last.kind is DecisionKind.ALONE:  # this car can be commanded only since this step
+    if last is None or last.kind is DecisionKind.ALONE:  # until this step, the plan could not command this car
         return False
     return last.mode is None or (known.mode == last.mode and known.verdict != Verdict.CONTRADICTED and not known.busy)
 
@@ -332,7 +332,7 @@ def _effects_in_force(plan: Plan, rules: Mapping[int, RuleState]) -> Iterator[tu
 
 
 def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, PinnedRole]:
-    """Return the roles that rules pin, by car. If several rules pin roles of one car, the first one counts."""
+    """Return the roles that rules pin, by car. If several rules pin roles of one car, the first one applies."""
     result: dict[str, PinnedRole] = {}
     for _, rule, state, effect in _effects_in_force(plan, rules):
         if effect.role is not None:
@@ -349,7 +349,7 @@ def _overrides(
     roles: Mapping[str, str],
     pinned: Mapping[str, PinnedRole],
 ) -> dict[str, Override]:
-    """Return the modes that rules in force give cars, whatever their roles say. The first rule counts.
+    """Return the modes that rules in force give cars, whatever their roles say. The first rule applies.
 
     A rule for several cars skips cars that do not know its mode, because they would refuse it again and again.
     """
@@ -486,7 +486,7 @@ def _command_leds(
             if not state.on or effect.led is None or effect.blink_s is not None:
                 continue
             of_any_car = LedRequest(index, position, state.trigger, None)
-            if of_any_car in memory.led_requests:  # the coordinator before its restart has set this color
+            if of_any_car in memory.led_requests:  # before a restart, the coordinator has set this color
                 result.add(of_any_car)
                 continue
             for car in targets(effect, state, subjects, allocation.roles):
@@ -515,7 +515,7 @@ def _command_blinks(
             continue
         for car in targets(effect, state, subjects, allocation.roles):
             if car in result or car not in candidates.free or not _obeys_led(snapshot.cars.get(car, UNKNOWN_CAR)):
-                continue  # the first rule counts
+                continue  # an earlier rule has set the LED of this car
             last = before.get(car)
             if last is not None and last.color == effect.led and now - last.at < effect.blink_s:
                 result[car] = last

@@ -156,7 +156,7 @@ class RoleAllocation:
 def follow_needs(
     plan: Plan, snapshot: FleetSnapshot, cars: tuple[str, ...], before: Mapping[tuple[str, str], Settled], now: float
 ) -> dict[tuple[str, str], Settled]:
-    """Evaluate the needs of each role for each car. For a value that is not measured now, the last one counts."""
+    """Evaluate the needs of each role for each car. For a value that is not measured now, use the last one."""
     result = {}
     values: dict[tuple[str, str], bool | None] = {}
     for role in plan.roles.values():

@@ -111,7 +111,7 @@ class Catalog:
         self.unanswered.clear()
         self.sessions.clear()
         drop_orphans(self.directory)
-        for path in sorted(sessions_in(self.directory), key=str):  # paths themselves compare slowly
+        for path in sorted(sessions_in(self.directory), key=str):  # texts compare much faster than paths
             if self._on_session is not None:
                 self._on_session(path)
             try:
@@ -179,7 +179,7 @@ class Catalog:
             self._find()
 
     def _answer(self, sql: str, parameters: Sequence[Any]) -> "pa.Table":
-        if self.unanswered:  # the answer would lack the messages of this session
+        if self.unanswered:  # the answer would lack the messages of these sessions
             name, why = next(iter(self.unanswered.items()))
             which = f"{name} and {more} more" if (more := len(self.unanswered) - 1) else name
             raise QueryFailed(
@@ -196,7 +196,7 @@ class Catalog:
         """
         found: dict[str, LeftOut] = {}
         for cached in self.sessions:
-            with suppress(OSError):  # deleted since the question
+            with suppress(OSError):  # the session was deleted since the question
                 for (key, cause), count in cached.left_out().counts.items():
                     topic = topics.of_key(key)
                     if topic is not None and topic.name in self._views:

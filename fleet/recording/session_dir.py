@@ -50,7 +50,7 @@ _VERSIONED_PACKAGES: Final = ("zenoh-car-fleet", "eclipse-zenoh", "mcap", "proto
 
 def versions() -> dict[str, str]:
     """Return the versions of Python, our package and the packages that affect the format."""
-    from importlib.metadata import version  # a tenth of the start of `fleet list`, which writes no session
+    from importlib.metadata import version  # here, because the import would slow down all commands
 
     return {"python": platform.python_version(), **{name: version(name) for name in _VERSIONED_PACKAGES}}
 

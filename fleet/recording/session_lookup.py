@@ -29,7 +29,7 @@ def sessions_place() -> Path:
     if not DEFAULT_SESSIONS.is_dir() and _FLEET_YAML.is_file():
         from fleet.fleetfile.fleet_file import read_fleet
 
-        with suppress(ValueError):  # a BadFile
+        with suppress(ValueError):  # BadFile is a ValueError
             return read_fleet(_FLEET_YAML, unbound=True).recordings or DEFAULT_SESSIONS
     return DEFAULT_SESSIONS
 

@@ -27,7 +27,7 @@ class StopCount:
         verb, command, phase = (str(getattr(event, name, "")) for name in ("verb", "id", "phase"))
         if event.DESCRIPTOR.full_name != EVENTS.message or verb not in STOPPING_VERBS:
             return
-        if not command:  # without an id, each car counts
+        if not command:  # without an id, the events of one command cannot be told from others: count each car
             self.count += phase == Phase.ASKED
         elif command not in self._recent:
             self.count += 1

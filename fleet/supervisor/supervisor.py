@@ -470,7 +470,7 @@ class Supervisor:
         try:
             values = json.loads(line)
         except ValueError:
-            return True  # plain text
+            return True  # the line is text for a person
         if process.kind is ProcessKind.RECORDER:
             self._session = values["session"]
             self._say("process", RECORDER, _describe_recording(values))
@@ -621,7 +621,7 @@ class Supervisor:
                 self.rows.pop(name, None)
         for name in found.restarted:
             self._add_car(self._spec.cars[name])
-        assert self._service is not None  # the command came through it
+        assert self._service is not None  # this command came through the service
         if planned := await self._set_plan(self._service, old, command):
             words.append(planned)
         if found.needs_restart:

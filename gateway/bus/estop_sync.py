@@ -131,7 +131,8 @@ class EstopSync:
                 await asyncio.sleep(len(self._due) ** 2 / ANSWERS_PER_S * random.random())  # noqa: S311 - jitter, no secret
             first = False
             self._changed.clear()
-            # If each gateway queried all others whenever one starts, a hundred starts would cause 300,000 answers.
+            # Query only gateways that are due. If each queried all others whenever one starts, a hundred starts would
+            # cause 300,000 answers.
             names = ("*",) if self._queries_all() else sorted(self._due)
             async for answer in self._answers(names):
                 self._on_state(merge, answer)
@@ -177,7 +178,7 @@ class EstopSync:
                     is_silent = False
                     on_state(answer)
             silent += is_silent
-            if silent == MAX_SINGLE_QUERIES:  # each costs a timeout, and delays the others
+            if silent == MAX_SINGLE_QUERIES:  # ask all others at once: each silent gateway costs a timeout
                 self._query(("*",), on_state)
                 return
 

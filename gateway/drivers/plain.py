@@ -408,7 +408,7 @@ class PlainDriver(Driver):
         if now < self._part_at or (pending := self.queue.next_part(now)) is None:
             return None
         data, held = pending.next_frame, self.queue.held
-        if isinstance(pending.command.what, ChangeSpeed):  # the motion at its arrival may be over: send the present one
+        if isinstance(pending.command.what, ChangeSpeed):  # a frame for a speed repeats the present motion
             is_driven = held is not None and held.pending.sent and self._stop is None
             data = self.motion_frame(held.motion if held is not None and is_driven else Motion.STOP)
         return self._write(data, FrameOrigin.COMMAND, pending)
@@ -463,7 +463,7 @@ class PlainDriver(Driver):
         times = [*self.queue.deadlines(), self.setup_at()]
         stop, held = self._stop, self.queue.held
         if stop is not None:
-            later = [self._ends_at]  # the last poll has handled the times that are over by now
+            later = [self._ends_at]  # only times to come: `poll` has handled the others
             if stop.index >= self.STOP_FRAMES:
                 later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
             times += [stop.next_at, *(each for each in later if each > now)]
@@ -505,7 +505,7 @@ class PlainDriver(Driver):
     def frames(self, what: Action) -> tuple[bytes | Later, ...]:
         """Return the frames of an action on a part of the car."""
         if isinstance(what, ChangeSpeed):
-            return (self.motion_frame(Motion.STOP),)  # a placeholder: when its turn comes, the present motion is sent
+            return (self.motion_frame(Motion.STOP),)  # a placeholder: `poll` sends the present motion instead
         return self.part_frames(what) or ()
 
     def _apply(self, what: Action, now: float) -> None:

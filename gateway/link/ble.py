@@ -260,7 +260,7 @@ class BleLink(BufferedLink):
         for note in () if adapter is None else ConnectionNote.all_of(adapter):
             try:
                 claim = _claim(self._url, note.address)
-            except CannotOpen:  # its gateway runs
+            except CannotOpen:  # another program has this device
                 continue
             if claim is not None:
                 await note.disconnect()
@@ -425,7 +425,7 @@ async def _within(seconds: float, work: Coroutine[Any, Any, T]) -> T:
             raise TimeoutError
         return task.result()
     finally:
-        while not task.done():  # its clean-up may wait as well: cancel that too
+        while not task.done():  # the task may wait in its clean-up, too: cancel it again
             task.cancel()
             await asyncio.wait({task}, timeout=_CANCEL_RETRY_S)
         if not task.cancelled():

@@ -92,7 +92,7 @@ def check_same_device(
     if first is None or first.vid is None or (now is not None and now.ids == first.ids):
         return
     if now is None and not os.path.exists(path):  # noqa: PTH110 - a device path, not a file to work with
-        return  # opening it raises the error
+        return  # the caller opens it next, which raises an error that says why
     found = f"{path}, about which the system says nothing" if now is None else _named([now])
     raise CannotOpen(
         f"{url}: another device is there, {found}; it was {_named([first])}: plug that in again, or restart this "

@@ -55,6 +55,7 @@ def _line(line: Sequence[Point] | LineEntry) -> tuple[Point, ...]:
 
 def _thing(name: str, entry: ThingEntry) -> MovingObject:
     path = tuple(entry.path)
+    back = path[-2:0:-1]  # without both ends, which are in `path` once
     return MovingObject(
         name,
         entry.x_m,
@@ -63,7 +64,7 @@ def _thing(name: str, entry: ThingEntry) -> MovingObject:
         width_m=entry.width_m,
         depth_m=entry.depth_m,
         heading_rad=radians(entry.heading_deg),
-        path=(*path, *path[-2:0:-1]) if entry.there_and_back else path,
+        path=(*path, *back) if entry.there_and_back else path,
         speed_m_s=entry.speed_m_s,
         waits_for_m=entry.waits_for_m,
         carried_by=entry.carried_by,

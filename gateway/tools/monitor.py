@@ -123,9 +123,8 @@ async def _listen(link: Link, lines: "MonitorOutput", writer: capture.CaptureWri
             deadline = lines.deadline()
             timeout = None if deadline is None else max(0.0, deadline - (time.monotonic() - origin))
             done, _ = await asyncio.wait([reading], timeout=timeout)
-            now = round(
-                time.monotonic() - origin, 6
-            )  # rounded as in the file, so that the file is decoded in the same way
+            # Round as in the file, so that the file is decoded in the same way.
+            now = round(time.monotonic() - origin, 6)
             if not done:
                 lines.tick(now)
                 continue

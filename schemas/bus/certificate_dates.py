@@ -33,7 +33,7 @@ class CertificateDates:
             if dates is None:
                 return None
             return cls(_time(dates[1], dates[2]), _time(dates[3], dates[4]))
-        except ValueError:  # a binascii.Error is one
+        except ValueError:  # binascii.Error is a ValueError
             return None
 
     def is_due(self, now: datetime) -> bool:

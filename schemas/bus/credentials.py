@@ -75,7 +75,7 @@ class Credentials:
                 return name
         role, _, own = (wanted or "person.NAME").partition(".")
         option = "" if role == IdentityRole.PERSON else f"--{role} "
-        own = own.replace("@", " --site ")  # a service at another site
+        own = own.replace("@", " --site ")  # services of another site have an @ in their names
         if first := self.first_hubs:
             words = (
                 f"This computer has no certificate for {wanted or 'you'}. On the computer of {first[0]}, `fleet hub "

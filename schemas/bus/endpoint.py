@@ -124,7 +124,7 @@ def client_config(endpoint: str, timeout_s: float, identity: str = "") -> zenoh.
 
 def credentials_of(endpoint: str) -> "Credentials":
     """Return the files for a hub with certificates, which may not exist."""
-    from schemas.bus.credentials import Credentials  # most buses have none, and a gateway's token waits for this
+    from schemas.bus.credentials import Credentials  # here, because the import delays a gateway, and most need none
 
     return Credentials.of(endpoint)
 

@@ -357,7 +357,7 @@ class Bus:
             def on_query(query: zenoh.Query) -> None:
                 words = unread(query)
                 if self._is_twin(number, lambda: mark_of_query(declaration, query), TWIN_S):
-                    with query:  # its other copy is answered
+                    with query:  # leave it unanswered, because its other copy gets an answer
                         return
                 if not words:
                     taken = callback(query)
@@ -428,7 +428,7 @@ class Bus:
                 with self._lock:
                     if number != self._number and self._overlap is None:
                         return
-                    is_twin = self._overlap is not None and (key in alive) is came  # both sessions see it
+                    is_twin = self._overlap is not None and (key in alive) is came  # the other session has reported it
                     if came:
                         alive.add(key)
                     else:

@@ -113,7 +113,7 @@ class PlanPhase:
 
     name: str
     roles: frozenset[str] | None = None
-    """The roles that count, or None if all count."""
+    """The roles that cars may have in this phase. None for all roles."""
     until: PlanCondition | None = None
     timeout_s: float | None = None
     next: str | None = None
@@ -122,7 +122,7 @@ class PlanPhase:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A plan for the coordinator. If several rules are about one car, the first rule in force counts."""
+    """A plan for the coordinator. If several rules are about one car, the first rule in force applies."""
 
     roles: Mapping[str, Role]
     fixed: Mapping[str, str]

@@ -57,7 +57,7 @@ def parse_entry(text: str, source: str = "plan") -> tuple[PlanEntry, Plan]:
     entry = document.validate(PlanEntry) or document.validate_partial(PlanEntry, _MISSING)
     if entry is None:
         document.raise_faults()
-    assert entry is not None  # otherwise raise_faults has raised
+    assert entry is not None  # `raise_faults` raises if there is no entry
     plan = _PlanParser(document, entry).plan(text)
     document.raise_faults()
     return entry, plan

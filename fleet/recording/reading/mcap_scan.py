@@ -21,9 +21,8 @@ _EXTRAS: Final = (Opcode.ATTACHMENT, Opcode.METADATA)
 _FIXED_LENGTHS: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 _PRIVATE: Final = 0x80
 """First opcode for records of other programs."""
-_CHUNK_HEAD: Final = struct.Struct(
-    "<QQQII"
-)  # first and last log time, size, checksum, length of the compression's name
+# First and last log time, size, checksum, length of the compression's name.
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MAX_COMPRESSION_NAME: Final = 16
 _MESSAGE_INDEX_HEAD: Final = struct.Struct("<HI")  # channel, length of the entries
 # The head of a chunk of at most MAX_RECORD_BYTES bytes.

@@ -1,6 +1,6 @@
 """Writes a session as one MCAP file in which each topic has one schema, as Foxglove and PlotJuggler expect it.
 
-A message of another type than its key calls for gets another topic: `stray/KEY/TYPE`. Nothing else changes: payloads,
+A message whose type does not fit its key gets another topic: `stray/KEY/TYPE`. Nothing else changes: payloads,
 times, sequences, attachments and metadata are those of the session.
 """
 

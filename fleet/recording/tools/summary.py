@@ -131,7 +131,7 @@ def of_session(session: Session) -> SessionSummary:
         found.marks = list(description.marks)
         found.kept = description.kept
         found.pins, found.gone = list(description.pins), session_dir.gone_of(description)
-        found.stops = description.stops if description.closed else None  # otherwise the last ones may not be counted
+        found.stops = description.stops if description.closed else None  # an open session may lack its last stops
     found.state, found.words = _state(session, read)
     if found.state is SessionState.WHOLE and (words := session.undescribed or session.lacking(found.messages)):
         found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"

@@ -23,7 +23,7 @@ BATCH_BYTES: Final = 4 << 20
 ROW_BYTES: Final = 256
 OTHER_TABLE: Final = "other"
 STRAY_PREFIX: Final = "stray."
-"""Prefix of tables with stray messages: each has another type than its key calls for."""
+"""Prefix of tables with stray messages: the type of each does not fit its key."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Exported:
     undecoded: int
     """Messages that do not match their protobuf schema. Their bytes are in the table of other messages."""
     left_out: LeftOut = field(default_factory=LeftOut)
-    """Messages whose key calls for one table, but which are in another."""
+    """Messages that are in another table than the one of their key."""
     undated: Mapping[str, int] = field(default_factory=dict)
     """Times that the format cannot hold, by name of the table. They are null there."""
 

@@ -47,7 +47,7 @@ def enforce(quota: Quota, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> E
     `keep`, because its session.json may not have them yet.
     """
     done = Enforced()
-    if not quota.total:  # do not even look at the disk
+    if not quota.total:  # without a quota, do not even look at the disk
         return done
     paths = [path.parent for path in root.glob(f"*/{SESSION_FILE}")]
     over = quota.excess(sum(map(_size, paths)))
@@ -169,7 +169,7 @@ def _remove_segments(session: Path, segments: Iterable[StoredSegment]) -> None:
     except OSError as error:
         if not session_dir.is_full(error):
             raise
-        (session / str(gone[0]["file"])).unlink(missing_ok=True)  # makes room for the list
+        (session / str(gone[0]["file"])).unlink(missing_ok=True)  # this makes room for the list
         session_dir.add_gone(session, gone)
     for each in gone:
         (session / str(each["file"])).unlink(missing_ok=True)

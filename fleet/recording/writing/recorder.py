@@ -299,7 +299,7 @@ class Recorder:
             self._add_backfilled(backfilled)
             for (key, sender), (count, number) in overflow.items():
                 self._session.drop_received(key, sender, number, count)
-            if self._session.gaps and has_room:  # a writer that is behind would only fall further behind
+            if self._session.gaps and has_room:  # without room, the answers would delay the writer even more
                 now_ns = self._now()
                 self._backfill.request({key: (now_ns - before) / 1e9 for key, before in self._session.gaps.items()})
                 self._session.gaps.clear()
@@ -490,7 +490,7 @@ class Recorder:
         except OSError as error:
             raise _CommandRefused(f"No session can be made in {self._root}: {error.strerror}") from None
         self._recording = True
-        self._pin_watch = PinWatch(self._pin_rules)  # messages that came meanwhile were not watched
+        self._pin_watch = PinWatch(self._pin_rules)  # begin anew: between the sessions, no message was watched
         self._publish()
 
     def _stop_session(self) -> None:

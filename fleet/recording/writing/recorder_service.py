@@ -81,7 +81,7 @@ class RecorderService:
             if self.speaks_for_fleet:
                 asked = str(query.key_expr)
                 return on_query(query, asked if "/@cmd/" in asked else self._fleet_status)
-            with query:  # another recorder answers
+            with query:  # leave it unanswered, because another recorder answers for the fleet
                 return True
 
         if self._site:
@@ -97,7 +97,7 @@ class RecorderService:
 
     def wait_for_hub(self, timeout_s: float = 5.0) -> None:
         """Send the hub a query and wait for the answer. The hub then has everything that was sent before."""
-        with contextlib.suppress(zenoh.ZError):  # without a bus nothing is in transit
+        with contextlib.suppress(zenoh.ZError):  # if the bus is gone, there is nothing to wait for
             self._bus.tokens(self._token, timeout_s)
 
     @property

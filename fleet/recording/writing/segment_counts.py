@@ -62,7 +62,7 @@ class SegmentCounts:
     def count(self, rows: Sequence[Row], stops: StopCount) -> None:
         """Count flushed messages, and the stops among them."""
         first_ns, last_ns = rows[0][1], rows[-1][1]
-        if last_ns - first_ns < 0 or first_ns < self._last_ns:  # the clock went back
+        if last_ns - first_ns < 0 or first_ns < self._last_ns:  # the clock was set back, so the rows are not in order
             first_ns, last_ns = min(row[1] for row in rows), max(row[1] for row in rows)
         self._first_ns = min(self._first_ns or first_ns, first_ns)
         self._last_ns = max(self._last_ns, last_ns)

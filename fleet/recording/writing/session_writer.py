@@ -133,7 +133,7 @@ class SessionWriter:
         published_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else received_ns
         sequence = 0
         if source is not None:
-            sequence = (source.source_sn + 1) & 0xFFFFFFFF  # as schemas.bus.sequence_of
+            sequence = (source.source_sn + 1) & 0xFFFFFFFF  # inlined schemas.bus.sequence_of
             entity = source.source_id
             sender = (entity.zid, entity.eid)  # an EntityGlobalId itself compares by identity
             last = state.tracker.last
@@ -257,7 +257,7 @@ class SessionWriter:
             late = bool(segment_s) and now_ns - self._segment_started_ns >= segment_s * 1e9
             if (late or 0 < self._options.segment_bytes <= self._segment.bytes) and not self.over:
                 self._finish_segment()
-                if not self.over:  # the index of the finished segment counts, too
+                if not self.over:  # the index of the finished segment may have filled the session
                     self._begin_segment(now_ns)
         except OSError as error:
             self._on_write_error(error)
@@ -333,7 +333,7 @@ class SessionWriter:
     def _open(self, now_ns: int, room_bytes: int) -> bool:
         """Begin a segment. Before the first one, begin the session. If space is short, pause and return False."""
         free = self.free_bytes
-        if self._unflushed:  # otherwise, if the first message is large, each attempt would begin an empty file
+        if self._unflushed:  # without room for a large first message, each attempt would begin another empty file
             room_bytes += len(self._unflushed[0][2])
         if why := shortage(free, room_bytes):
             self._pause(why)
@@ -345,7 +345,7 @@ class SessionWriter:
                 self._made = True
             self._begin_segment(now_ns)
         except OSError as error:
-            if self._made and not made:  # no session without a segment
+            if self._made and not made:  # remove the new session, because it has no segment
                 shutil.rmtree(self.path, ignore_errors=True)
                 self._made = False
             self._on_write_error(error)

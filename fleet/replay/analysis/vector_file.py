@@ -93,7 +93,7 @@ def read(path: Path) -> tuple[str, list[Item]]:
     try:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             objects.append((number, json.loads(line)))
-    except ValueError as error:  # UnicodeDecodeError is one
+    except ValueError as error:  # UnicodeDecodeError is a ValueError
         raise BadVector(f"{path}, line {len(objects) + 1}: this is not JSON in UTF-8: {error}") from None
     head = objects[0][1] if objects else None
     if not isinstance(head, dict) or not isinstance(head.get("format"), int) or not isinstance(head.get("car"), str):

@@ -20,7 +20,7 @@ class Schedule:
     _last_ns: int | None = None
 
     def due_s(self, at_ns: int) -> float:
-        """Return when the next message is due. A backward step of the clock counts as no time."""
+        """Return when the next message is due. A backward step of the clock takes no time."""
         if self._last_ns is not None:
             gap_ns = max(0, at_ns - self._last_ns)
             if self.longest_gap_ns is not None and gap_ns > self.longest_gap_ns:

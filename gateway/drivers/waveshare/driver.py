@@ -201,7 +201,7 @@ class WaveshareDriver(PlainDriver):
 
     def feed(self, data: bytes, now: float) -> list[Event]:
         """Return the events in the bytes."""
-        if self._booting and self._setup is Setup.LISTEN and b"{" not in data:  # dots, without the end of a line
+        if self._booting and self._setup is Setup.LISTEN and b"{" not in data:  # a booting car sends dots, not lines
             self._listen_on(now)
         return [event for each in self._lines.feed(data) for event in self._events(each, now)]
 
@@ -496,7 +496,7 @@ class WaveshareDriver(PlainDriver):
             self._queue_settings()
             return None
         self._setup = Setup.READY
-        self._model.heard_at = max(now, self._model.heard_at or now)  # the stream begins now
+        self._model.heard_at = max(now, self._model.heard_at or now)  # silence counts from now, when the stream begins
         return None
 
     def _queue_settings(self) -> None:

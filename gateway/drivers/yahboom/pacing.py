@@ -116,7 +116,7 @@ class Pacing:
     def _interval_s(self) -> float:
         """The interval of the reports with an echo, as far as it is known."""
         expected_s, no_echo = self.profile.interval_s, self.learned.no_echo
-        if no_echo.is_known:  # without an echo a report takes longer by the whole ranging
+        if no_echo.is_known:  # an interval without an echo is longer by the whole ranging
             expected_s = min(expected_s, no_echo.median_s - self.profile.ranging_s)
         return self.learned.interval_s(expected_s)
 
@@ -172,9 +172,8 @@ class Pacing:
             case Gate.NOTHING:
                 return float("-inf")
             case Gate.FLIGHT:
-                return self._written_at + max(
-                    FLIGHT_S, self._sure_block_s
-                )  # a block that is only possible does not count
+                # Do not wait for blocks that are only possible.
+                return self._written_at + max(FLIGHT_S, self._sure_block_s)
             case Gate.ALONE:
                 return self.buffer_until
 

@@ -285,7 +285,7 @@ class StopEvidence:
         """Record a `MODE00`. With `awake`, no other frame of ours blocks the car: its block gap will be exact."""
         self._mode_00_at = now if awake else None
         if not awake:
-            self._blocks.append(_Block(None, self.close_s, now))  # so that this interval does not count
+            self._blocks.append(_Block(None, self.close_s, now))  # so that the habits do not learn this interval
         self._first_delay_s = None
         self._unjudged = False
         self.settles_at = None
