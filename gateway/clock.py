@@ -11,7 +11,7 @@ MIN_STEP_NS: Final = 2_000_000
 MAX_ERROR_NS: Final = 100_000
 """Maximum error of an undisturbed measurement. A larger error causes another attempt."""
 MAX_ATTEMPTS: Final = 10
-"""Maximum attempts. If the scheduler disturbs all of them, the best one counts."""
+"""Maximum attempts. If the scheduler disturbs all of them, the best one is used."""
 
 
 class WallClock:

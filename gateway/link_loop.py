@@ -52,8 +52,8 @@ class LinkLoop:
     ) -> None:
         """Make the loop of a link. `on_gap` is called before bytes are judged, to detect a gap of the asyncio loop.
 
-        `log_open` is called when the opening of the link should be logged: at once, or if the last link was soon lost,
-        when this one is proven (`Attempts`).
+        `log_open` logs that the link is open. It is called at once, but if the last link was soon lost, only when this
+        one is proven (`Attempts`).
         """
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()

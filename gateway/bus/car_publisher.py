@@ -161,7 +161,7 @@ class CarPublisher:
         event.words = record.words
         if command.age_s is not None:
             event.age_s = command.age_s
-        if record.worst_case_s > 0:  # only a stop has one
+        if record.worst_case_s > 0:  # only a stop has a worst case
             event.worst_case_s = record.worst_case_s
         if record.phase not in _ON_ARRIVAL:
             event.took_s = record.took_s

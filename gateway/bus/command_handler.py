@@ -118,7 +118,7 @@ class CommandHandler:
             status=status,
             reason=answer.reason or "",
             words=answer.words,
-            worst_case_s=answer.worst_case_s or None,  # only a stop has one
+            worst_case_s=answer.worst_case_s or None,  # only a stop has a worst case
         )
         assert request.query is not None
         with request.query as query:
@@ -162,7 +162,7 @@ class CommandHandler:
             self._log_command(record)
             original: tuple[bytes, str] | None = None
             if request is not None and record.command.id == command_id:
-                original, request = (request.payload or b"", request.encoding), None  # only in the first record
+                original, request = (request.payload or b"", request.encoding), None  # only the first record has it
             self._publisher.publish_command(record, original)
             if record.phase is Phase.SENT:
                 self._sent.add(record.command.id)

@@ -338,7 +338,7 @@ class SerialLink(Link):
 class SerialKind(LinkKind[SerialUrl | UsbUrl]):
     """Serial ports, by path or by USB device."""
 
-    async def open(self, url: SerialUrl | UsbUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - no car waits
+    async def open(self, url: SerialUrl | UsbUrl, timeout_s: float, *, first: bool) -> Link:  # noqa: ARG002 - there is no queue
         """Open a serial port. Each call searches for a USB device again. Raises CannotOpen if it does not open."""
         if str(url) in _opening:  # another attempt would leave another hanging thread
             raise CannotOpen(f"{url}: an earlier attempt to open the port still hangs: unplug it, and plug it in again")

@@ -27,7 +27,7 @@ MAX_READ_S: Final = 0.001
 """Maximum duration of an undisturbed reading of the clocks. When a `SleepWatch` starts, it
 repeats a reading that took longer."""
 MAX_READS: Final = 10
-"""Maximum readings at the start. If the scheduler disturbs all of them, the best one counts."""
+"""Maximum readings at the start. If the scheduler disturbs all of them, the best one is used."""
 MONOTONIC_COUNTS_SLEEP: Final = sys.platform == "win32"
 """True if `time.monotonic()` and the times of asyncio continue during a sleep."""
 

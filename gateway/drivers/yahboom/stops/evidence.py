@@ -76,8 +76,8 @@ EARLY_S: Final = 0.05
 WIRE_S: Final = 0.02
 """Minimum time from the end of a block to the arrival of the report after it: a report takes longer on the wire."""
 LATE_S: Final = 0.2
-"""Additional time on a slow link for the report that shows the end of a mode. A report in this time is only a block
-gap."""
+"""Time by which a slow link may delay the report that shows the end of a mode. A report that is late by up to this time
+shows only a block gap."""
 OTHER_MODE_LINGERS_S: Final = 1.0
 """Maximum time for which readings of a mode still arrive after the `MODE00` that ends it."""
 LONGER_S: Final = 0.65
