@@ -43,11 +43,12 @@ _QUEUE_SIZE: Final = 16_384
 """Maximum number of messages in the queue of one subscription: three seconds of 100 cars."""
 _MAX_BATCH: Final = 4096
 MAX_REOPENED: Final = 10
-"""Maximum number of times that a topic gets a new channel after a refusal. A client may subscribe to any numbers."""
+"""Maximum number of times that a topic gets a new channel. A bad client could cause refusals without end."""
 _REFUSED: Final = re.compile(r"subscribe to unknown channel: (\d+)")
 """The SDK's log message about a client that it refused."""
 _LAST_TIMEOUT_S: Final = 3.0
-"""Timeout for the last message of a topic that is published only on change. If no process can answer, nobody waits."""
+"""Timeout for the last message of a topic that is published only on change. If nobody can answer, the query ends at
+once."""
 
 # The SDK logs an error for each message to a client that has gone without closing its connection.
 _sdk_log = logging.getLogger("foxglove")

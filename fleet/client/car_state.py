@@ -125,7 +125,7 @@ class CarState:
         return True
 
     def on_presence(self, *, present: bool) -> None:
-        """Note whether the car's gateway is on the bus. When it comes back it publishes its states again."""
+        """Note whether the car's gateway is on the bus. When it comes back, it publishes its states again."""
         if present and not self.present:
             self._forget_states()
         self.present = present

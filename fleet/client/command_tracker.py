@@ -92,12 +92,12 @@ class PendingCommand:
         self._hubs = hubs
         self._hubs_then = hubs()
         self.is_taken: Future[bool] = Future()
-        """True as soon as a gateway has answered, or nobody is waited for any more. False if the bus was lost or the
+        """True as soon as a gateway has answered, or no outcome is awaited any more. False if the bus was lost or the
         Fleet was closed before a gateway answered."""
         self.lost_bus = False
         """True if the bus was lost before the stop was answered."""
         self._bus_back_at: float | None = None
-        """The time at which the bus came back. None while it is lost, or if it never was."""
+        """The time at which the bus came back. None if it is still lost, or was not lost."""
         self._unanswered_at: dict[str, float] = {}
         """The time at which the last query of a stop ended without an answer, by car."""
         self.inbox: queue.Queue[Item] = queue.Queue(_MAX_QUEUED_ITEMS)

@@ -81,7 +81,7 @@ def describe_shortfalls(
         full = len(found) >= topic.history_size
         if since_s is not None:
             if full and oldest_s < since_s and (last is None or last > topic.history_size):
-                lines.append(f"{key}: goes back {oldest_s:.1f} s of {since_s:g} s, because {keeps}")
+                lines.append(f"{key}: only the last {oldest_s:.1f} s of {since_s:g} s, because {keeps}")
         elif last is not None and len(found) < last:
             more = keeps if full else "its gateway has no more"
             lines.append(f"{key}: {len(found)} of {last}, because {more}")

@@ -80,7 +80,7 @@ class LeaseMonitor:
 
 
 def _other(sender: str, ours: str) -> str:
-    """Return the name of another sender. Another program of our own person is named as such."""
+    """Return the name of another sender, or say that it is another program of our own person."""
     name = keys.name_of(sender)
     return f"another program of {name}" if name == keys.name_of(ours) else name
 

@@ -189,7 +189,7 @@ class Watch:
     def _on_sample(self, sample: Sample) -> None:
         """Queue a sample. Runs on the subscription's Zenoh thread, the only one that puts."""
         if self._queue.full():
-            with contextlib.suppress(queue.Empty):  # the reader was faster
+            with contextlib.suppress(queue.Empty):  # the reader has just emptied the queue
                 self._queue.get_nowait()
                 self.dropped += 1
         self._queue.put_nowait(sample)

@@ -26,7 +26,7 @@ from schemas.process import stdio
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _PROGRESS_STEP: Final = 1024
 ROWS_AT_ONCE: Final = 1024
-"""Rows of a block. Tables are made and printed in blocks, because a million rows would fill the memory."""
+"""Number of rows in a block. A table is printed in blocks, because a million rows would fill the memory."""
 MAX_CELL: Final = 60
 """Maximum characters of a cell with text from a recording. Anybody may have written that text, of any length."""
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})

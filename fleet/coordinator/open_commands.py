@@ -60,7 +60,7 @@ class OpenCommands:
             self._last_failures.pop(f"{car} led", None)
 
     def _note(self, what: str, words: str) -> None:
-        if words and words != self._last_failures.get(what):  # a blinking LED fails every second
+        if words and words != self._last_failures.get(what):  # a blinking LED may fail every second: report it once
             self._on_failure(words)
         self._last_failures[what] = words
 
