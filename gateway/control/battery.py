@@ -68,8 +68,8 @@ class Battery:
     _loaded_at: float = float("-inf")
     _other: BatteryLevel | None = None
     _since: float = 0.0
-    """`_other` is the level that the readings show instead of `level`. They have been on its side of `level` since
-    `_since`."""
+    """`_other` is the level that the readings show instead of `level`. Since `_since`, they have all been on that
+    side of `level`."""
 
     def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
         """Update the level with a measured voltage. Return True if it has changed. With `loaded`, motors may be on."""

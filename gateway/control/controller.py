@@ -42,8 +42,8 @@ from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason,
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
-"""Margin for a drive that waits for the car. The drive expires this long after the longer of two times: the announced
-wait, and its own duration."""
+"""Margin for a drive that waits for the car. The drive expires after the announced wait or its own duration, whichever
+is longer, and this margin."""
 
 
 class Controller(Generic[D_co]):

@@ -109,7 +109,7 @@ class Safety:
             estop = replace(estop, id=f"{estop.id}.{estop.at_ns:x}")
         self.put_on_hold(estop.by, estop.at_ns, estop.rank)
         first = self._estops.get(estop.id)
-        is_new = first is None or (estop.fleet_wide and not first.fleet_wide)  # new, or extended from the car to all
+        is_new = first is None or (estop.fleet_wide and not first.fleet_wide)  # new, or from now on for all cars
         if is_new and sum(each.fleet_wide is estop.fleet_wide for each in self.estops) >= MAX_ESTOPS:
             return first or estop
         if first is None:
