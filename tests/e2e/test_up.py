@@ -27,6 +27,7 @@ from schemas.topics import TOPICS
 from tests.support.disk import MAY_MOUNT, Disk, disk
 from tests.support.ports import free_endpoint, free_port
 from tests.support.processes import PATIENCE_S, TAKEN, FleetProcesses, driving, freeze, wait_for
+from tests.support.soaks import only_in_soak
 from tests.support.text_parts import has_parts
 from tests.support.up import Up, fleet_command
 
@@ -90,9 +91,7 @@ def test_up_restarts_only_the_killed_process(up: Up, name: str) -> None:
         up.ready(car)
 
 
-@pytest.mark.parametrize(
-    "name", ["@simulator", *(pytest.param(each, marks=pytest.mark.soak) for each in ("green", "@recorder", "@console"))]
-)
+@pytest.mark.parametrize("name", ["@simulator", *only_in_soak(("green", "@recorder", "@console"))])
 def test_up_kills_and_restarts_hung_process(up: Up, name: str) -> None:
     pid = up.running(name)
     freeze(pid)

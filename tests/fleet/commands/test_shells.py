@@ -15,6 +15,7 @@ from schemas.bus import reply_message, router_config
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.ports import free_endpoint
 from tests.support.processes import wait_for
+from tests.support.soaks import only_in_soak
 from tests.support.terminal import Terminal
 
 SHELLS = {
@@ -29,7 +30,7 @@ BEGIN_OF_LINE = "\x01"
 GROUPS_KEY = "fleet/@supervisor/status"
 
 
-@pytest.mark.parametrize("shell", ["bash", *(pytest.param(each, marks=pytest.mark.soak) for each in ("zsh", "fish"))])
+@pytest.mark.parametrize("shell", ["bash", *only_in_soak(("zsh", "fish"))])
 def test_tab_completes_commands_cars_groups_and_motions(shell: str, tmp_path: Path) -> None:
     """The groups come from the running fleet, because there is no fleet file here."""
     if shutil.which(shell) is None:

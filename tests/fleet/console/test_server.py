@@ -58,6 +58,7 @@ from tests.support.network_client import NetworkDevice, network_port, untrusting
 from tests.support.page_flood import HALF_REQUESTS, PLAN, half_request
 from tests.support.ports import free_endpoint
 from tests.support.processes import LONG_S, FleetProcesses, wait_for
+from tests.support.soaks import only_in_soak
 
 PEOPLE = ("teacher:lead", "mia", "thief")
 """The people who may drive red."""
@@ -782,7 +783,7 @@ COMMANDS = 3 * int(COMMAND_BURST)
 """Commands of a device that floods gateways."""
 
 
-@pytest.mark.parametrize("kind", ["take", "give_back", "unpause", "do"])
+@pytest.mark.parametrize("kind", ["take", "do", *only_in_soak(["give_back", "unpause"])])
 def test_commands_in_a_flood_reach_gateways_at_a_devices_rate(stage: ServerStage, kind: str) -> None:
     begun: list[str] = []
     giver = f"giver_{kind}"  # late events of the case before are not this device's

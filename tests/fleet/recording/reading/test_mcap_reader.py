@@ -63,7 +63,7 @@ def cut_it_shows_every_whole_chunk(original: Original, lengths: Iterable[int], p
 
 
 def test_cut_anywhere_it_shows_every_whole_chunk(original: Original, tmp_path: Path) -> None:
-    cut_it_shows_every_whole_chunk(original, sampled(original)[::2], tmp_path / "x.mcap")
+    cut_it_shows_every_whole_chunk(original, sampled(original)[::5], tmp_path / "x.mcap")
 
 
 @pytest.mark.soak
@@ -82,7 +82,7 @@ def report(path: Path) -> str:
 
 
 def test_bit_flip_is_told_and_loses_one_chunk_at_most(original: Original, tmp_path: Path) -> None:
-    for at in sampled(original)[::2]:
+    for at in sampled(original)[::5]:
         flipped_it_loses_its_own_chunk_at_most(original, at, [at % 8], tmp_path)
 
 
@@ -120,8 +120,7 @@ def without_an_index_it_loses_its_own_chunk_at_most(original: Original, step: in
 
 
 def test_bit_flip_without_index_loses_one_chunk_at_most(original: Original, tmp_path: Path) -> None:
-    """Each byte is flipped in a file of one of the lengths."""
-    without_an_index_it_loses_its_own_chunk_at_most(original, 3, tmp_path / "x.mcap")
+    without_an_index_it_loses_its_own_chunk_at_most(original, 9, tmp_path / "x.mcap")
 
 
 @pytest.mark.soak
@@ -233,7 +232,7 @@ def test_absurd_record_length_is_not_believed(original: Original, tmp_path: Path
     at = 8
     while at < len(original.data) - 8:
         (length,) = struct.unpack_from("<Q", original.data, at + 1)
-        for number, absurd in enumerate(ABSURD):
+        for number, absurd in enumerate(ABSURD[at % 3 :: 3]):
             data = original.data[: at + 1] + struct.pack("<Q", absurd) + original.data[at + 9 :]
             # Every second file has no end, and so no index.
             judge(original, data[:-8] if (number + at) % 2 else data, at + 1, tmp_path / "x.mcap")
@@ -400,7 +399,7 @@ def test_any_spliced_file_makes_nothing_up(original: Original, tmp_path: Path) -
 
 
 @given(opcode=st.sampled_from([*Opcode, 0, 0x20, 0x80, 0xFF]), body=st.binary(max_size=200), data=st.data())
-@settings(max_examples=300)
+@settings(max_examples=100)
 def test_any_record_anywhere_gives_no_surprise(
     original: Original, tmp_path: Path, opcode: int, body: bytes, data: st.DataObject
 ) -> None:

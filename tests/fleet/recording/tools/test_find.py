@@ -37,6 +37,7 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import START_NS, Made
 from tests.support import in_process
+from tests.support.soaks import only_in_soak
 
 S = 1_000_000_000
 NEAR = "range_m < 0.3"
@@ -85,7 +86,7 @@ def test_one_known_part_decides_until_it_is_stale() -> None:
     assert spans("light.left and range_m > 0.3", at_its_limit) == [(3, 3)]
 
 
-@pytest.mark.parametrize("seed", range(200))
+@pytest.mark.parametrize("seed", [*range(40), *only_in_soak(range(40, 200))])
 def test_find_hits_when_wait_would_end(seed: int) -> None:
     """Each prefix of random readings with gaps has a hit exactly if `fleet wait --for` would have ended in it."""
     rng = random.Random(seed)
@@ -125,7 +126,7 @@ CONDITIONS = (
 )
 
 
-@pytest.mark.parametrize("seed", range(200))
+@pytest.mark.parametrize("seed", [*range(40), *only_in_soak(range(40, 200))])
 def test_live_and_from_disk_the_hits_are_the_same(seed: int, tmp_path: Path) -> None:
     """A session with gaps, restarts, drops and a clock that is set back, seen by who listened, and found in its file.
 
