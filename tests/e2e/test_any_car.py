@@ -128,7 +128,7 @@ def test_shows_stops_is_learned_for_each_kind_of_car(cars: KindsUnderTest) -> No
     def found(kind: CarKind) -> str:
         return str(cars.fleet.state("health", kind.name).shows_stops)
 
-    for _ in range(3):
+    for _ in range(6):
         outcomes = commands(cars, "stop")
         # On a busy machine a report is read late, and its stop is not shown in time. The next one is.
         ended = all((code, outcome["ok"]) == (0, True) for code, outcome in outcomes.values())

@@ -79,7 +79,7 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("drive red up", '"up" … motion. … : forward, back, '),
         ("drive red blue foward", '"foward" … motion. … mean forward? (see fleet drive --help)'),
         ("drive red forward blue", '"blue" … motion last.'),
-        ("drive red forward 2s", '"2s" … : --for 2s'),
+        ("drive red forward 2s", '"2s" … --for 2s'),
         ("drive red stop", '"stop" … : fleet stop red'),
         ("drive Red forward", 'fleet: No car "Red". … mean "red"?'),
         ("drive r!d forward", "'r!d' … : use 1 to 32 of a-z"),
