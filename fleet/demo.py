@@ -14,12 +14,12 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 import click
+from msgspec import Struct, field, to_builtins
 
 from fleet.client.client import Fleet
 from fleet.client.outcome import Outcome
@@ -48,8 +48,7 @@ PROCESS_EXIT_TIMEOUT_S: Final = 30.0
 """Timeout for the exit of a process: twice the worst case of the longest stop sequence."""
 
 
-@dataclass(frozen=True, slots=True)
-class Check:
+class Check(Struct, frozen=True):
     """One line of the summary."""
 
     name: str
@@ -57,8 +56,7 @@ class Check:
     words: str
 
 
-@dataclass(slots=True)
-class Demo:
+class Demo(Struct):
     """One run of the demo: its checks, and the messages that it received."""
 
     folder: Path
@@ -134,7 +132,7 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
             "ok": not failed,
             "session": str(session),
             "rrd": None if rrd is None else str(rrd),
-            "checks": [asdict(check) for check in run.checks],
+            "checks": [to_builtins(check) for check in run.checks],
         }
         click.echo(json.dumps(result))
     else:

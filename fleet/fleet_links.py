@@ -4,8 +4,9 @@ Finds links that name the same port.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from schemas.links import LinkUrl, PortKey, parse_link
 
@@ -13,8 +14,7 @@ LINK_SIM: Final = "sim"
 """The link of a car that `fleet up` simulates."""
 
 
-@dataclass(frozen=True, slots=True)
-class SimLink:
+class SimLink(Struct, frozen=True):
     """The link of a simulated car, which has no port."""
 
 

@@ -5,8 +5,9 @@ an option.
 """
 
 import re
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 SESSIONS_PER_QUOTA: Final = 10
 """Minimum number of sessions that fit into a quota. Nothing of the session that is being written may be removed, so
@@ -31,8 +32,7 @@ def format_size(size: int) -> str:
     return f"{size // factor}{unit}"
 
 
-@dataclass(frozen=True, slots=True)
-class Quota:
+class Quota(Struct, frozen=True):
     """Maximum size of all sessions together, and of one, in bytes. 0 means no limit."""
 
     total: int = 0

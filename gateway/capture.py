@@ -7,9 +7,10 @@ import json
 import math
 import stat
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final
+
+from msgspec import Struct
 
 FORMAT: Final = "zenoh-car-fleet raw 1"
 # A link returns at most 1 MiB at once, and JSON needs at most 6 bytes for each byte.
@@ -20,8 +21,7 @@ class BadCapture(ValueError):
     """A file that is not a capture. The message names the file, the line and the fault."""
 
 
-@dataclass(frozen=True, slots=True)
-class CapturedBytes:
+class CapturedBytes(Struct, frozen=True):
     """Bytes as they arrived. `at` is in seconds since the start of the capture. The file has microseconds."""
 
     at: float

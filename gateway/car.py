@@ -14,12 +14,12 @@ import random
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 import zenoh
+from msgspec import Struct, field
 
 from gateway import drivers
 from gateway.bus.car_publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of, shown_state
@@ -67,8 +67,7 @@ CANCEL_RETRY_S: Final = 0.5
 log = logging.getLogger("gateway")
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
+class Settings(Struct, frozen=True):
     """The settings of `gateway run`."""
 
     car: str

@@ -6,10 +6,12 @@ the file has them for each link. Pauses and e-stops of the whole fleet do not de
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
 from math import inf
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct, to_builtins
+from msgspec.structs import replace
 
 from gateway.control.holds_and_leases import PersistedSafety
 from schemas.atomic_file import DAMAGE, write_state
@@ -21,8 +23,7 @@ MAX_OTHER_LINKS: Final = 16
 """Maximum number of other links whose holds, loans and e-stops the file keeps. Beyond it, the oldest is dropped."""
 
 
-@dataclass(frozen=True, slots=True)
-class _OfLink:
+class _OfLink(Struct, frozen=True):
     """The hold, e-stops and loan of the car at one link."""
 
     link: str
@@ -72,7 +73,7 @@ class SafetyStateFile:
 
     def save(self, state: PersistedSafety) -> None:
         """Replace the file atomically. Raises OSError if that fails."""
-        content = asdict(state) | {"link": self._link, "others": [asdict(each) for each in self._others]}
+        content = to_builtins(state) | {"link": self._link, "others": [to_builtins(each) for each in self._others]}
         write_state(self.path, json.dumps(content), sync=True)
 
     def _unreadable(self, why: str, now_ns: int) -> PersistedSafety:

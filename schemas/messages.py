@@ -1,13 +1,13 @@
 """Message classes by name, their encodings and JSON (that any Zenoh tool can read), and observations. No bus here."""
 
 import json
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
 from google.protobuf import json_format
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from google.protobuf.message import DecodeError, Message
+from msgspec import Struct
 
 from schemas.gen import fleet_v1_pb2
 from schemas.topics import PROTOBUF
@@ -16,8 +16,7 @@ from schemas.words import Level
 JSON: Final = "application/json"
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(Struct, frozen=True):
     """A message, and the time from which its age counts: s, by the observer's clock."""
 
     message: Any

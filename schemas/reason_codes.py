@@ -3,8 +3,9 @@
 docs/how-to/troubleshooting.md has a section for each code. A test compares these tables, the source and the page.
 """
 
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from schemas.words import Level, Reason
 
@@ -35,8 +36,7 @@ REASONS: Final[dict[str, str]] = {
 """Reasons of the gateway (`schemas.words.Reason`), and `no_answer` and `no_result` of the client."""
 
 
-@dataclass(frozen=True, slots=True)
-class EventCode:
+class EventCode(Struct, frozen=True):
     """One code of `event/log`."""
 
     level: Level

@@ -8,10 +8,12 @@ checks nobody's identity. A stop or an e-stop needs no right.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import inf
 from typing import Any, Final, Self
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from schemas.keys import NAME_RULE, is_name, name_of, person_of
 from schemas.words import Rank, Reason, Scope
@@ -32,8 +34,7 @@ def rank_of(text: str) -> Rank:
 # ---------------------------------------------------------------------- people
 
 
-@dataclass(frozen=True, slots=True)
-class Sender:
+class Sender(Struct, frozen=True):
     """The sender of a command."""
 
     name: str = "anonymous"
@@ -63,8 +64,7 @@ class PersonRole(StrEnum):
     """A person of the fleet who drives other cars."""
 
 
-@dataclass(frozen=True, slots=True)
-class People:
+class People(Struct, frozen=True):
     """The people of a fleet, as one car sees them. `roles` is None if the fleet has no people."""
 
     roles: Mapping[str, PersonRole] | None = None
@@ -166,8 +166,7 @@ def _parse(entry: str) -> tuple[str, PersonRole]:
 # ---------------------------------------------------------------------- holds, e-stops, pauses, loans, leases
 
 
-@dataclass(frozen=True, slots=True)
-class Hold:
+class Hold(Struct, frozen=True):
     """Keeps the coordinator from moving a stopped car. The hold of a lead also keeps persons and scripts from doing so.
 
     `since_ns` is in ns since the epoch.
@@ -178,8 +177,7 @@ class Hold:
     rank: Rank = Rank.PERSON
 
 
-@dataclass(frozen=True, slots=True)
-class Estop:
+class Estop(Struct, frozen=True):
     """One latched emergency stop. `at_ns` is the wall clock since the epoch. If `fleet_wide`, all gateways latch it."""
 
     id: str
@@ -190,8 +188,7 @@ class Estop:
     rank: Rank = Rank.PERSON
 
 
-@dataclass(frozen=True, slots=True)
-class FleetPause:
+class FleetPause(Struct, frozen=True):
     """One pause of the whole fleet. `at_ns` is the wall clock, ns since the epoch."""
 
     id: str
@@ -201,8 +198,7 @@ class FleetPause:
     rank: Rank = Rank.PERSON
 
 
-@dataclass(frozen=True, slots=True)
-class Loan:
+class Loan(Struct, frozen=True):
     """The car is lent to the person `to`. `since_ns` is the wall clock. `duration_s` is not published."""
 
     to: str
@@ -216,8 +212,7 @@ class Loan:
         return self.duration_s - max(0.0, (now_ns - self.since_ns) / 1e9)
 
 
-@dataclass(frozen=True, slots=True)
-class LeaseState:
+class LeaseState(Struct, frozen=True):
     """The sender who controls the car. `until` (s, monotonic) is known only to the gateway."""
 
     holder: Sender
@@ -307,8 +302,7 @@ _REASONS: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Denial:
+class Denial(Struct, frozen=True):
     """Why a right is denied. `mark` is the e-stop, pause, hold, loan or lease that it rests on."""
 
     bar: Bar
@@ -320,8 +314,7 @@ class Denial:
         return _REASONS[self.bar]
 
 
-@dataclass(frozen=True, slots=True)
-class Authority:
+class Authority(Struct, frozen=True):
     """The rules and facts that decide about rights on one car now. E-stops and pauses are listed oldest first."""
 
     people: People = NO_PEOPLE

@@ -18,8 +18,9 @@ that ends normally removes them all, so Home Assistant forgets the devices.
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
+
+from msgspec import Struct
 
 from fleet.client.car_state import CarState
 from schemas import keys
@@ -53,8 +54,7 @@ class Publication(NamedTuple):
     retain: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Entity:
+class Entity(Struct, frozen=True):
     """One value of a car."""
 
     name: str

@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final
 
 import aiomqtt
+from msgspec import Struct
 
 from fleet.bridges.home_assistant import OFFLINE, HomeAssistant, Publication
 from fleet.client.car_state import CarState
@@ -56,8 +56,7 @@ class BrokerRefused(Exception):
     """The broker refuses this user or password. The message says so."""
 
 
-@dataclass(frozen=True, slots=True)
-class Broker:
+class Broker(Struct, frozen=True):
     """The address of the broker, and the user under which we log in there."""
 
     host: str

@@ -19,10 +19,12 @@ nothing any more, is not ready.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
 from functools import cache
 from math import inf
 from typing import Any, Final, Self
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.client.claims import CarClaims, claims_of
 from fleet.client.reading import Reading, age_of_answer_s
@@ -81,8 +83,7 @@ def _empty(topic: str) -> Any:
     return messages.message_class(topics.TOPICS[topic].message)()
 
 
-@dataclass(slots=True)
-class CarState:
+class CarState(Struct):
     """The newest messages of one car on the bus. Times `at` and `now`: s, of one clock that the caller chooses."""
 
     car: str

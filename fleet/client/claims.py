@@ -8,9 +8,10 @@ Lists, status, shutdown, doctor, console and Python all use these texts, so that
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from math import isinf
 from typing import Any, Final
+
+from msgspec import Struct
 
 from schemas import topics
 from schemas.words import UNKNOWN, Basis, Motors
@@ -26,8 +27,7 @@ NOT_STOPPED: Final = "NOT STOPPED"
 NO_GATEWAY: Final = "no gateway"
 
 
-@dataclass(frozen=True, slots=True)
-class CarClaim:
+class CarClaim(Struct, frozen=True):
     """One statement about a car."""
 
     what: str
@@ -136,8 +136,7 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 3)
 
 
-@dataclass(frozen=True, slots=True)
-class CarClaims:
+class CarClaims(Struct, frozen=True):
     """The claims about one car."""
 
     motors: CarClaim

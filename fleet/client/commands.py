@@ -7,8 +7,9 @@ rejected.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
+
+from msgspec import Struct
 
 from fleet.client.effects import ESTOP_FLEET, RELEASE
 from fleet.client.outcome import Until
@@ -27,8 +28,7 @@ STOP_TTL_S: Final = 10.0
 useful."""
 
 
-@dataclass(frozen=True, slots=True)
-class CommandRequest:
+class CommandRequest(Struct, frozen=True):
     """One command that has no id and no time yet."""
 
     verb: str

@@ -4,8 +4,9 @@ The condition is checked before the first query. Unknown fields and conditions t
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final, Self
+
+from msgspec import Struct
 
 from fleet.client.reading import Reading
 from fleet.conditions import BadExpression, Expression, compared_in, fields_of, parse, topic_aliases_of
@@ -59,8 +60,7 @@ def check_car(name: str) -> str:
     return keys.check_name(name)
 
 
-@dataclass(frozen=True, slots=True)
-class KeyCondition:
+class KeyCondition(Struct, frozen=True):
     """A condition on one reading. Each message type that has the fields has its own expression."""
 
     text: str

@@ -5,8 +5,9 @@ likeliest cause comes first.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any, Final
+
+from msgspec import Struct, to_builtins
 
 from fleet.client.car_state import CarState
 from fleet.client.claims import describe_end_of_doubt
@@ -53,8 +54,7 @@ _NO_TROUBLE: Final = (Reason.SUPERSEDED, Reason.DUPLICATE)
 """Reasons of commands that ended early because somebody intended it."""
 
 
-@dataclass(frozen=True, slots=True)
-class CarEvidence:
+class CarEvidence(Struct, frozen=True):
     """Everything that is known about one car now."""
 
     state: CarState
@@ -93,8 +93,7 @@ class CarEvidence:
         return {each: count for each, count in self.state.link.rejects.items() if each not in _NO_FRAMES}
 
 
-@dataclass(frozen=True, slots=True)
-class DoctorFinding:
+class DoctorFinding(Struct, frozen=True):
     """One thing that is odd."""
 
     code: str
@@ -108,8 +107,7 @@ class DoctorFinding:
         return f"{self.cause} Type: {self.todo}"
 
 
-@dataclass(frozen=True, slots=True)
-class DoctorCheck:
+class DoctorCheck(Struct, frozen=True):
     """One row of the table. `cause` returns the cause in words, empty if the check finds nothing."""
 
     code: str
@@ -444,7 +442,7 @@ def describe_reports(health: Any) -> str:
 
 def as_dict(evidence: CarEvidence, options: str = "") -> dict[str, Any]:
     """Return the findings and the facts, for JSON. `options` as in `diagnose`."""
-    found = [asdict(finding) for finding in diagnose(evidence, options)]
+    found = [to_builtins(finding) for finding in diagnose(evidence, options)]
     return {"car": evidence.state.car, "findings": found, "facts": dict(describe(evidence))}
 
 

@@ -5,9 +5,10 @@ so that missed messages do not distort them.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Final
+
+from msgspec import Struct
 
 from fleet.client.reading import Reading
 from schemas import keys, topics
@@ -17,8 +18,7 @@ SURVEY_S: Final = 2.5
 SURVEYED_SERVICES: Final = (keys.COORDINATOR, keys.RECORDER)
 
 
-@dataclass(frozen=True, slots=True)
-class KeyInfo:
+class KeyInfo(Struct, frozen=True):
     """One key."""
 
     key: str

@@ -7,9 +7,10 @@ A car whose lease was lost is not stopped, because it has another holder.
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from types import TracebackType
 from typing import Any, Final, Generic, Protocol, TypeVar
+
+from msgspec.structs import replace
 
 from fleet.client.commands import CommandRequest, drive_request, lease_request
 from fleet.client.outcome import OUTCOME_MARGIN_S, LeaseLost, NotCarriedOut, Outcome

@@ -1,8 +1,9 @@
 """Waits until a condition holds for a reading, or has held for some time. Pure: readings and time are arguments."""
 
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Final
+
+from msgspec import Struct
 
 from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading
@@ -21,8 +22,7 @@ class NotInTime(TimeoutError):
         self.last = last
 
 
-@dataclass(slots=True)
-class _LastReading:
+class _LastReading(Struct):
     """The newest reading of one key."""
 
     at: datetime

@@ -3,13 +3,13 @@
 import json
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
 from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Any, Final
 
 import click
 import yaml
+from msgspec import to_builtins
 
 from fleet.commands.fleet_file import DEFAULT_FILE, print_errors
 from fleet.commands.options import cli_errors, json_option
@@ -127,12 +127,12 @@ class _Checks:
         widest = max(len(each.car) for each in found)
         for each in found:
             state = "ok" if each.ok else "error"
-            self._print(asdict(each), f"{each.car:{widest}}  {state:5}  {each.link}: {each.words}")
+            self._print(to_builtins(each), f"{each.car:{widest}}  {state:5}  {each.link}: {each.words}")
             self._worse(_Result.GOOD if each.ok else _Result.FAILED)
         links = {name: parse_fleet_link(car.link) for name, car in fleet.cars.items()}
         for load in check_adapters(links, list_adapters()):
             if load.is_crowded:
-                self._print(asdict(load), f"{load.adapter:{widest}}  warn   {load.words}")
+                self._print(to_builtins(load), f"{load.adapter:{widest}}  warn   {load.words}")
         for kind, path in ((FileKind.PLAN, fleet.plan), (FileKind.WORLD, fleet.world)):
             if path is not None:
                 self.check(kind, path)
@@ -141,7 +141,7 @@ class _Checks:
         plan = parse_plan(read_text(file), str(file))
         findings = find_findings(plan, self._cars)
         for each in findings:
-            self._print({"file": str(file), **asdict(each)}, each.at(str(file)))
+            self._print({"file": str(file), **to_builtins(each)}, each.at(str(file)))
         if any(each.severity is Severity.ERROR for each in findings):
             self._worse(_Result.FAILED)
             return

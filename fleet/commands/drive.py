@@ -1,10 +1,10 @@
 """`fleet drive, mode, stop, estop, resume`: the commands that move cars or stop them."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Final, Never
 
 import click
+from msgspec.structs import replace
 
 from fleet.client.claims import NOT_STOPPED
 from fleet.client.client import Fleet

@@ -7,11 +7,11 @@ import json
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
 import click
+from msgspec import to_builtins
 
 from fleet.commands.options import cli_errors
 from fleet.commands.params import Choice, Duration, Number
@@ -60,7 +60,7 @@ def print_errors(error: BadFile, *, as_json: bool = False) -> None:
     """Print every error of a file on its own line: for a person to stderr, as JSON to stdout."""
     if as_json:
         for problem in error.problems:
-            click.echo(json.dumps({"file": error.source, "severity": "error", **asdict(problem)}))
+            click.echo(json.dumps({"file": error.source, "severity": "error", **to_builtins(problem)}))
     else:
         click.echo(str(error), err=True)
 

@@ -4,10 +4,11 @@ import functools
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, Never
 
 import click
+from msgspec.structs import replace
 
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest

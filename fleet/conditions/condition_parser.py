@@ -8,9 +8,10 @@ words:      in quotes, 'low' or "low", and nothing is escaped in them
 import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Never
+
+from msgspec import Struct
 
 from fleet.conditions.expression import (
     KINDS,
@@ -83,8 +84,7 @@ _INSTEAD: Final = {"=": "==", "&": "and", "|": "or", "!": "not", "=<": "<=", "=>
 _KEYWORDS: Final = ("and", "or", "not", "true", "false")
 
 
-@dataclass(frozen=True, slots=True)
-class _Token:
+class _Token(Struct, frozen=True):
     kind: str
     """number, name, word, sign, or end."""
     text: str

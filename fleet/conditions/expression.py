@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, TypeAlias
 
+from msgspec import Struct
+
 Value: TypeAlias = bool | int | float | str
 Lookup: TypeAlias = Callable[[str], object | None]
 """Returns the value of a name, or None if it was not measured."""
@@ -55,8 +57,7 @@ class Name:
         return self.written or self.name
 
 
-@dataclass(frozen=True, slots=True)
-class Literal:
+class Literal(Struct, frozen=True):
     """A value that is written in the text."""
 
     value: Value
@@ -70,8 +71,7 @@ class Literal:
         return format_literal(self.value)
 
 
-@dataclass(frozen=True, slots=True)
-class Compare:
+class Compare(Struct, frozen=True):
     """A comparison of two values."""
 
     left: "Node"
@@ -82,8 +82,7 @@ class Compare:
         return " ".join((_in_parentheses(self.left), self.op, _in_parentheses(self.right)))
 
 
-@dataclass(frozen=True, slots=True)
-class Not:
+class Not(Struct, frozen=True):
     """A condition that is negated by `not`."""
 
     inner: "Node"
@@ -92,8 +91,7 @@ class Not:
         return f"not {f'({self.inner})' if isinstance(self.inner, And | Or) else self.inner}"
 
 
-@dataclass(frozen=True, slots=True)
-class And:
+class And(Struct, frozen=True):
     """Two or more conditions that are joined by `and`."""
 
     parts: tuple["Node", ...]
@@ -102,8 +100,7 @@ class And:
         return " and ".join(f"({part})" if isinstance(part, Or) else str(part) for part in self.parts)
 
 
-@dataclass(frozen=True, slots=True)
-class Or:
+class Or(Struct, frozen=True):
     """Two or more conditions that are joined by `or`."""
 
     parts: tuple["Node", ...]
@@ -128,8 +125,7 @@ def _in_parentheses(side: Node) -> str:
     return str(side) if isinstance(side, Name | Literal) else f"({side})"
 
 
-@dataclass(frozen=True, slots=True)
-class Expression:
+class Expression(Struct, frozen=True):
     """A parsed condition. Its text is normalized. Parsing that text gives the same condition."""
 
     root: Node

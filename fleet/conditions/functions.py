@@ -5,16 +5,16 @@ function. A single message has no earlier readings, so `watch` and `wait` have n
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import inf
 from typing import Final, TypeAlias
+
+from msgspec import Struct
 
 Measured: TypeAlias = Sequence[tuple[float, float]]
 """Times (s, of one clock) and values of the newest readings that measured a field, the newest last."""
 
 
-@dataclass(frozen=True, slots=True)
-class ConditionFunction:
+class ConditionFunction(Struct, frozen=True):
     """One row: a function that computes a number from its only argument, a field that is a number."""
 
     name: str

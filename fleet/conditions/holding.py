@@ -8,8 +8,9 @@ without it. If the condition is not true by the other values alone, it ended wit
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final, NamedTuple
+
+from msgspec import Struct, field
 
 from fleet.conditions.expression import Expression, Lookup
 
@@ -40,8 +41,7 @@ class HeldStep(NamedTuple):
     """True if a span begins with this reading."""
 
 
-@dataclass(slots=True)
-class Holding:
+class Holding(Struct):
     """One condition over the readings of one car or key. The readings must come in the order of their times.
 
     source_of: the source of a name, such as its topic. stale_after_ns: how long a value of a source counts, or None for

@@ -5,8 +5,9 @@ alternative is impossible if its comparisons of one field exclude each other, or
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import Final, TypeAlias
+
+from msgspec import Struct, field
 
 from fleet.conditions.expression import And, Compare, Expression, Literal, Name, Node, Not, Op, Or, ValueKind, names_in
 from fleet.conditions.functions import FUNCTIONS, split_call
@@ -113,8 +114,7 @@ def _one_of(several: Iterable[list[_Alternative]]) -> list[_Alternative]:
     return found
 
 
-@dataclass(slots=True)
-class _Constraint:
+class _Constraint(Struct):
     """The values of one field that a set of comparisons allows."""
 
     least: float = float("-inf")

@@ -1,17 +1,17 @@
 """The abilities of a car, and the reason for each that it lacks, computed from the states of its gateway. Pure."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
+
+from msgspec import Struct
 
 from gateway import drivers
 from schemas.car_profile import CarProfile
 from schemas.words import CAPABILITIES, Light, Mode
 
 
-@dataclass(frozen=True, slots=True)
-class Abilities:
+class Abilities(Struct, frozen=True):
     """The controls of one car's page."""
 
     modes: tuple[str, ...] = ()

@@ -7,8 +7,9 @@ no budget here: repeated STOPs are merged and never dropped, and a page that was
 
 from collections import Counter
 from collections.abc import Hashable
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from schemas.token_bucket import TokenBucket
 
@@ -53,8 +54,7 @@ def page_budget() -> TokenBucket:
     return TokenBucket(PAGE_RATE, PAGE_BURST)
 
 
-@dataclass(slots=True)
-class _Budget:
+class _Budget(Struct):
     messages: TokenBucket
     requests: TokenBucket
     checks: TokenBucket
@@ -62,8 +62,7 @@ class _Budget:
     closed_until: float = float("-inf")
 
 
-@dataclass(slots=True)
-class Budgets:
+class Budgets(Struct):
     """The budgets of persons by name, of devices by id (None means this computer), and of strangers by address."""
 
     _all: dict[Hashable, _Budget] = field(default_factory=dict)
@@ -126,8 +125,7 @@ class Budgets:
         return found
 
 
-@dataclass(slots=True)
-class StopMerge:
+class StopMerge(Struct):
     """Merges the STOPs of one person. The first is sent at once. All others within MERGE_S become one more STOP."""
 
     _open_at: float = float("-inf")

@@ -3,9 +3,10 @@
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.client.car_state import CarState
 from fleet.client.diagnosis import FAILED_PHASES, CarEvidence, describe, diagnose, doubtful
@@ -41,8 +42,7 @@ _LINES: Final = ("left_outer", "left_inner", "right_inner", "right_outer")
 _SIDES: Final = ("left", "right")
 
 
-@dataclass(slots=True)
-class BatteryTrend:
+class BatteryTrend(Struct):
     """The change of a battery's voltage over some minutes."""
 
     _samples: deque[tuple[float, float]] = field(default_factory=deque)

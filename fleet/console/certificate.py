@@ -5,7 +5,6 @@ import hashlib
 import os
 import ssl
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +13,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
+from msgspec import Struct
 
 from fleet.hub.x509_parts import builder, common_name, end_entity, new_key, pem, private_pem
 from schemas.atomic_file import write_atomically
@@ -28,8 +28,7 @@ class BadKeyFile(OSError):
     """The key file does not contain a key."""
 
 
-@dataclass(frozen=True, slots=True)
-class Certificate:
+class Certificate(Struct, frozen=True):
     """A certificate and its key, as files."""
 
     path: Path

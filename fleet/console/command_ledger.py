@@ -3,8 +3,9 @@
 Pure.
 """
 
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.client.diagnosis import FAILED_PHASES
 from schemas import messages
@@ -16,8 +17,7 @@ MAX_WIRE_FRAMES: Final = 6
 """Number of frames of one command that a page shows."""
 
 
-@dataclass(slots=True)
-class LedgerCommand:
+class LedgerCommand(Struct):
     """One command since its first event."""
 
     at_ms: int

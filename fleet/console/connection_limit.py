@@ -5,8 +5,9 @@ the file descriptors and the time of the process that stops the cars.
 """
 
 from collections.abc import Hashable
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 MAX_CONNECTIONS: Final = 640
 """Maximum number of connections from the network: forty devices, each with as many as it may have."""
@@ -17,16 +18,14 @@ STRANGER_TIMEOUT_S: Final = 10.0
 """Timeout of a connection that has shown no cookie of a paired device."""
 
 
-@dataclass(slots=True)
-class _OpenConnection:
+class _OpenConnection(Struct):
     address: str
     since_s: float
     device: str = ""
     """The paired device whose cookie the connection has shown. Empty if it has shown none."""
 
 
-@dataclass(slots=True)
-class ConnectionLimit:
+class ConnectionLimit(Struct):
     """The open connections, oldest first, by any key."""
 
     _open: dict[Hashable, _OpenConnection] = field(default_factory=dict)
@@ -76,8 +75,7 @@ class ConnectionLimit:
         return len(self._open)
 
 
-@dataclass(slots=True)
-class LogLimit:
+class LogLimit(Struct):
     """Lets one message pass in each interval, and counts the messages that it holds back."""
 
     interval_s: float = 10.0

@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from msgspec import to_builtins
+
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
 from fleet.client.command_tracker import PendingCommand
@@ -394,7 +396,7 @@ class Console:
         # All guests share one sender, so a stop with this sender may come from another guest.
         names = {"sender": None if whose.is_guest else operator.sender, "fleet": self._fleet.sync.name}
         words = {"plottable": plottable(), "modes": MODE_TEXTS}
-        page.answer(t="hello", page=page.number, **names, person=asdict(page.person), **words)
+        page.answer(t="hello", page=page.number, **names, person=to_builtins(page.person), **words)
         for feed in self._feeds:
             feed.on_page(page)
         return page

@@ -4,8 +4,9 @@ The server numbers its ticks. While the finger is down, the page echoes each tic
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from schemas.limits import STREAM_SILENCE_S
 from schemas.rights import NO_PEOPLE, LeaseState, People, Sender
@@ -31,8 +32,7 @@ class PressRefused(Exception):
     """The press may not begin. The text is for a person."""
 
 
-@dataclass(slots=True)
-class HeldPress:
+class HeldPress(Struct):
     """A motion of some cars that the person at a page holds down."""
 
     client: int

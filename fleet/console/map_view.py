@@ -8,8 +8,9 @@ which the caller chooses.
 import math
 from collections import deque
 from collections.abc import Container, Iterable
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from schemas.topics import TOPICS
 
@@ -31,8 +32,7 @@ _MAX_MAP_NAME_LENGTH: Final = 64
 _Points = list[tuple[int, float, float]]
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
+class Place(Struct, frozen=True):
     """One known place of a car. `frame` is empty for the truth about a simulated car."""
 
     x_m: float
@@ -52,8 +52,7 @@ class Place:
         return now - self.at > ((TRUTH if self.is_true else POSE).stale_after_s or math.inf)
 
 
-@dataclass(slots=True)
-class MapView:
+class MapView(Struct):
     """The newest place of each car with its trail, and the newest floor."""
 
     _places: dict[str, Place] = field(default_factory=dict)

@@ -10,10 +10,10 @@ import time
 from asyncio import sslproto
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any, Final
 
 import segno
+from msgspec.structs import replace
 
 from fleet.console.certificate import Certificate, ensure_certificate
 from fleet.console.connection_limit import ConnectionLimit, LogLimit

@@ -2,8 +2,9 @@
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
@@ -15,8 +16,7 @@ IDLE_CLIENT_S: Final = 5.0
 """Time for which a person's client stays open without a page, because the page may only be reloading."""
 
 
-@dataclass(slots=True)
-class _Member:
+class _Member(Struct):
     """The operator of one person, and the number of this person's pages."""
 
     opening: "asyncio.Task[tuple[Fleet, ConsoleOperator]]"

@@ -5,8 +5,10 @@ A page is not trusted. So each value is checked here, and the gateway decides wh
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from typing import Any, Final, Self
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from fleet.client import commands
 from schemas import keys
@@ -24,8 +26,7 @@ class BadPageMessage(ValueError):
     """The message of a page is not allowed."""
 
 
-@dataclass(frozen=True, slots=True)
-class PageMessage:
+class PageMessage(Struct, frozen=True):
     """One message of a page, with checked access to its fields."""
 
     fields: Mapping[str, Any]

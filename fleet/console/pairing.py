@@ -8,9 +8,11 @@ import hashlib
 import hmac
 import json
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field, replace
 from itertools import count
 from typing import Any, Final, Literal, Self
+
+from msgspec import Struct, field, to_builtins
+from msgspec.structs import replace
 
 from fleet.hub.join_code import CODE_ALPHABET
 from schemas import keys
@@ -68,8 +70,7 @@ class BadBook(ValueError):
     """The text is not a book of people."""
 
 
-@dataclass(frozen=True, slots=True)
-class PagePerson:
+class PagePerson(Struct, frozen=True):
     """The person at a page. The person at this computer has the console's own name."""
 
     name: str
@@ -91,8 +92,7 @@ _ANY: Final = PagePerson(GUEST, GUEST)
 """The person of the code of a class."""
 
 
-@dataclass(frozen=True, slots=True)
-class PairingCode:
+class PairingCode(Struct, frozen=True):
     """A code that pairs one device, once. The code of a class (its person is a guest) pairs any number of devices."""
 
     digest: str
@@ -107,8 +107,7 @@ class PairingCode:
         return 0 <= now - self.issued_s < (CLASS_LIFETIME_S if self.person.is_guest else CODE_LIFETIME_S)
 
 
-@dataclass(frozen=True, slots=True)
-class PairedDevice:
+class PairedDevice(Struct, frozen=True):
     """A browser with a cookie of the console."""
 
     id: str
@@ -132,8 +131,7 @@ class PairedDevice:
         return "expired" if now < self.expires_s + COOKIE_MEMORY_S else "unknown"
 
 
-@dataclass(frozen=True, slots=True)
-class PeopleBook:
+class PeopleBook(Struct, frozen=True):
     """The open codes and the paired devices of one console, oldest first."""
 
     codes: tuple[PairingCode, ...] = ()
@@ -265,7 +263,7 @@ class PeopleBook:
 
     def as_text(self) -> str:
         """Return the book as JSON."""
-        return json.dumps(asdict(self), indent=1)
+        return json.dumps(to_builtins(self), indent=1)
 
     @classmethod
     def of_text(cls, text: str) -> Self:
@@ -284,8 +282,7 @@ class PeopleBook:
             raise BadBook(str(error)) from None
 
 
-@dataclass(slots=True)
-class GuessLimit:
+class GuessLimit(Struct):
     """Counts wrong codes, and makes the addresses that they come from wait. Times are monotonic."""
 
     wrong: int = 0

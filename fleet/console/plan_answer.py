@@ -4,8 +4,9 @@ The dry run is the first decision that the coordinator's own code would make, fo
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.coordinator.observer import FleetObserver
 from fleet.policy.difference import plan_changes
@@ -23,8 +24,7 @@ MAX_TOLD_CHARACTERS: Final = 500
 """Maximum length of one text. A plan with 300 roles gives a reason of 30,000 characters for one idle car."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlanQuestion:
+class PlanQuestion(Struct, frozen=True):
     """A plan to check, and what the console knows of the fleet. Ages and times: s."""
 
     text: str

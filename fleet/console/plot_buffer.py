@@ -1,9 +1,10 @@
 """The values that one page plots, kept until they are sent. Pure."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
+
+from msgspec import Struct
 
 from fleet.conditions import fields_of, value_in
 from fleet.console.page_requests import BadPageMessage, PageMessage
@@ -15,8 +16,7 @@ MAX_BUFFERED_VALUES: Final = 200_000
 """Maximum number of values that wait for one page. While a page reads nothing, further values are dropped."""
 
 
-@dataclass(frozen=True, slots=True)
-class Series:
+class Series(Struct, frozen=True):
     """One field of one topic of one car, over time."""
 
     car: str

@@ -9,8 +9,9 @@ time.
 """
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from schemas.token_bucket import TokenBucket
 
@@ -36,8 +37,7 @@ MAX_ADDRESSES: Final = 1024
 """Maximum number of remembered addresses without a connection. Beyond it, an idle address is forgotten."""
 
 
-@dataclass(slots=True)
-class _AddressLine:
+class _AddressLine(Struct):
     """The connections of one address."""
 
     budget: TokenBucket = field(default_factory=lambda: TokenBucket(ADDRESS_RATE, ADDRESS_BURST))
@@ -52,8 +52,7 @@ class _AddressLine:
         return len(self.silent) + len(self.ready)
 
 
-@dataclass(slots=True)
-class WaitingRoom:
+class WaitingRoom(Struct):
     """The lines by address. `choose` returns a random one of some connections."""
 
     choose: Callable[[Sequence[Hashable]], Hashable]

@@ -6,10 +6,11 @@ policy/ makes all decisions. One of them is to send nothing to a car on hold. Th
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import zenoh
+from msgspec.structs import replace
 
 from fleet.client.client import Fleet
 from fleet.coordinator.inbox import Inbox, Item, QueriedSample

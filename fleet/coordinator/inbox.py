@@ -9,10 +9,10 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Final, Self
 
 import zenoh
+from msgspec import Struct
 
 from fleet.client.client import Fleet
 from schemas import keys
@@ -28,8 +28,7 @@ _MAX_CARS_QUERIED_SINGLY: Final = 8
 """Maximum number of cars that are queried one by one. If more arrive together, one query asks all cars."""
 
 
-@dataclass(frozen=True, slots=True)
-class QueriedSample:
+class QueriedSample(Struct, frozen=True):
     """A sample from a query, so it may be old."""
 
     sample: Sample
@@ -38,8 +37,7 @@ class QueriedSample:
 Item = Sample | QueriedSample | zenoh.Query
 
 
-@dataclass(frozen=True, slots=True)
-class Heard:
+class Heard(Struct, frozen=True):
     """Messages, and gateways that came or left: one batch from the inbox of a program that only listens."""
 
     now: float

@@ -1,9 +1,11 @@
 """Observes the fleet for the coordinator: tokens and messages in, snapshots (policy/snapshot.py) out. No Zenoh."""
 
 from collections.abc import Container, Iterable, Mapping
-from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Any, Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.client.car_state import CarState
 from fleet.client.reading import age_of_answer_s
@@ -24,8 +26,7 @@ MAX_UNCONFIRMED_CARS: Final = 256
 """Maximum number of unlisted names on the bus that count as cars before they publish their states."""
 
 
-@dataclass(slots=True)
-class FleetObserver:
+class FleetObserver(Struct):
     """The cars as last observed. `listed` has the cars in the fleet file, and is empty if there is no file."""
 
     listed: Mapping[str, CarSnapshot] = field(default_factory=dict)

@@ -6,9 +6,11 @@ reading and writing are ignored.
 
 import contextlib
 import json
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import to_builtins
+from msgspec.structs import replace
 
 from fleet.policy.state import PersistedPolicy
 from schemas.atomic_file import DAMAGE, write_state
@@ -63,7 +65,7 @@ class CoordinatorStateFile:
         if _same(state, self._last):
             return True
         self._last = state
-        content = {"endpoint": self._endpoint, "run": self._run, **asdict(state)}
+        content = {"endpoint": self._endpoint, "run": self._run, **to_builtins(state)}
         with contextlib.suppress(OSError):
             write_state(self.path, json.dumps(content))
             return True

@@ -6,9 +6,10 @@ gateway.
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final
+
+from msgspec import Struct
 
 from fleet.client.car_state import CarState
 from schemas.words import UNKNOWN, LinkState, Mode, Motors, RecorderState
@@ -37,8 +38,7 @@ class Unit(StrEnum):
     BYTES = "bytes"
 
 
-@dataclass(frozen=True, slots=True)
-class Metric:
+class Metric(Struct, frozen=True):
     """One row of the table."""
 
     name: str
@@ -61,8 +61,7 @@ class Metric:
         return f"{self.name}_total" if self.kind is MetricKind.COUNTER else self.name
 
 
-@dataclass(frozen=True, slots=True)
-class CarMetric(Metric):
+class CarMetric(Metric, frozen=True):
     """A metric of each car. The first label is the car."""
 
     values: Callable[[CarState, float], Values] = lambda *_: ()

@@ -5,9 +5,10 @@ numbers here are typical ones.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from fleet.fleet_links import FleetLink
 from schemas.bluetooth import (
@@ -22,8 +23,7 @@ ADAPTERS: Final = Path("/sys/class/bluetooth")
 _FIRST: Final = "the first adapter"
 
 
-@dataclass(frozen=True, slots=True)
-class AdapterCheck:
+class AdapterCheck(Struct, frozen=True):
     """The load of one adapter. For `auto`, the load of all adapters of the computer together."""
 
     adapter: str

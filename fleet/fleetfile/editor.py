@@ -4,10 +4,10 @@ The editor inserts the link into the text at YAML's marks, and never writes the 
 and refuses it if anything except the link has changed.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import yaml
+from msgspec.structs import replace
 
 from fleet.fleetfile.fleet_file import FleetFile, parse_fleet
 from fleet.fleetfile.template import format_key, quote

@@ -6,10 +6,11 @@ reached.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.conditions import BadExpression, Expression
 from fleet.fleet_links import LINK_SIM, FleetLink, parse_fleet_link, shared_ports
@@ -40,8 +41,7 @@ from schemas.yaml_document.fault_words import Where, quote_value, suggest
 PATHS: Final = ("plan", "world")
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
+class Limits(Struct, frozen=True):
     """The limits of a car.
 
     longest_drive_s: maximum `duration_s` of a drive, up to 3600. speed_max: 0 to 1 of its top speed. battery_*_v:
@@ -56,8 +56,7 @@ class Limits:
     on_battery_critical: BatteryAction = BatteryAction.REFUSE
 
 
-@dataclass(frozen=True, slots=True)
-class FleetCar:
+class FleetCar(Struct, frozen=True):
     """One car with its type and the defaults resolved.
 
     link, platform: values for `gateway run --link` and `--platform`. color: #rrggbb. capabilities: words for modes and
@@ -74,8 +73,7 @@ class FleetCar:
     roles: tuple[str, ...] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class FleetPerson:
+class FleetPerson(Struct, frozen=True):
     """One person with their rank and the cars that they may drive. If `cars` is None, they may drive all."""
 
     rank: PersonRank = PersonRank.PERSON
@@ -86,8 +84,7 @@ class FleetPerson:
         return self.drives is None or car in self.drives
 
 
-@dataclass(frozen=True, slots=True)
-class PinRule:
+class PinRule(Struct, frozen=True):
     """A condition. Recordings are pinned from `before_s` before it becomes true to `after_s` after it ends."""
 
     condition: Expression
@@ -95,8 +92,7 @@ class PinRule:
     after_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class FleetFile:
+class FleetFile(Struct, frozen=True):
     """A fleet file with resolved cars and absolute paths.
 
     endpoint: the bus, or None for FLEET_ENDPOINT or loopback. quota: maximum size of the recordings. console_port: the

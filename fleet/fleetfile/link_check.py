@@ -10,9 +10,10 @@ import os
 import socket
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
 
 from fleet.fleet_links import SimLink, may_be_same, parse_fleet_link
 from fleet.fleetfile.fleet_file import FleetCar
@@ -31,8 +32,7 @@ CLOSED_PORT: Final = 9
 """A TCP port at which no host listens (discard). A reachable host refuses a connection to it at once."""
 
 
-@dataclass(frozen=True, slots=True)
-class LinkCheck:
+class LinkCheck(Struct, frozen=True):
     """The result of the check of one car's link."""
 
     car: str

@@ -4,8 +4,9 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from fleet.fleet_links import parse_fleet_link
 from schemas.links import SerialUrl, UsbUrl
@@ -23,8 +24,7 @@ class ScanFailed(Exception):
     """`gateway scan` failed. The text says why."""
 
 
-@dataclass(frozen=True, slots=True)
-class FoundLink:
+class FoundLink(Struct, frozen=True):
     """A link that may be a car. `verdict` is one of POSSIBLE_VERDICTS. `platform` is detected, or `auto`."""
 
     url: str

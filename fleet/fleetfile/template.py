@@ -3,8 +3,9 @@
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from fleet.fleetfile.fleet_file import default_color
 from schemas.platform_name import AUTO
@@ -12,8 +13,7 @@ from schemas.platform_name import AUTO
 SCHEMA_URL: Final = "https://raw.githubusercontent.com/zenoh-car-fleet/zenoh-car-fleet/main/deploy/{}.schema.json"
 
 
-@dataclass(frozen=True, slots=True)
-class NewCar:
+class NewCar(Struct, frozen=True):
     """A car in a new fleet file."""
 
     name: str

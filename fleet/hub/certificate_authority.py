@@ -6,7 +6,6 @@ other computer that has joined can pretend to be the hub.
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Final
 
@@ -15,6 +14,7 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
+from msgspec import Struct
 
 from fleet.hub.x509_parts import builder, common_name, end_entity, key_usage, new_key, pem, private_pem
 from schemas.bus.certificate_dates import CertificateDates
@@ -27,8 +27,7 @@ class BadRequestForCertificate(ValueError):
     """The text is not a request for a certificate, or the request is not signed with its own key."""
 
 
-@dataclass(frozen=True, slots=True)
-class KeyPair:
+class KeyPair(Struct, frozen=True):
     """A certificate and its private key, PEM."""
 
     certificate: bytes

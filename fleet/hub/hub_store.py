@@ -9,10 +9,11 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
+
+from msgspec import Struct, field, to_builtins
 
 from fleet.hub import certificate_authority
 from fleet.hub.access_rules import access_control
@@ -46,8 +47,7 @@ class BrokenHub(BusError):
     """The files of the hub are damaged. The text says which, and what to do."""
 
 
-@dataclass(slots=True)
-class KnownIdentity:
+class KnownIdentity(Struct):
     """One identity that has a certificate."""
 
     until: str
@@ -70,8 +70,7 @@ class KnownIdentity:
         return identity if self.generation == 1 else f"{identity}.{self.generation}"
 
 
-@dataclass(slots=True)
-class HubStore:
+class HubStore(Struct):
     """The files of one hub."""
 
     credentials: Credentials
@@ -268,7 +267,7 @@ class HubStore:
 
     def _save(self, listens: Iterable[str] = ()) -> None:
         """Write the identities, and the rules if they changed. The hub restarts when the rules change."""
-        stored: Mapping[str, object] = {name: asdict(each) for name, each in sorted(self.known.items())}
+        stored: Mapping[str, object] = {name: to_builtins(each) for name, each in sorted(self.known.items())}
         path = self.directory / HUB_FILE
         chosen = list(listens)
         if not chosen:

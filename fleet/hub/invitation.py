@@ -12,10 +12,11 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.hub import certificate_authority
 from fleet.hub.certificate_authority import BadRequestForCertificate
@@ -46,8 +47,7 @@ class NotThisHub(NotJoined):
     """No hub answers there, or a hub that did not make the code."""
 
 
-@dataclass(frozen=True, slots=True)
-class Joined:
+class Joined(Struct, frozen=True):
     """Everything that a joining computer gets."""
 
     identity: str

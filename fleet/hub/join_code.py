@@ -7,8 +7,9 @@ beginning of the fingerprint of the hub's authority. So nobody between the two c
 import base64
 import hmac
 import secrets
-from dataclasses import dataclass
 from typing import Final, Self
+
+from msgspec import Struct
 
 CODE_ALPHABET: Final = "23456789ABCDEFGHJKLMNPQRSTUVWXYZ"
 """Letters and digits that people do not confuse."""
@@ -27,8 +28,7 @@ class BadCode(ValueError):
     """A text that is not a code."""
 
 
-@dataclass(frozen=True, slots=True)
-class JoinCode:
+class JoinCode(Struct, frozen=True):
     """A code of 24 characters."""
 
     secret: str

@@ -5,8 +5,9 @@ with live messages, `find` feeds it from files.
 """
 
 from collections.abc import Collection
-from dataclasses import replace
 from typing import Any, Final
+
+from msgspec.structs import replace
 
 from fleet.conditions import BadExpression, Expression, parse
 from fleet.conditions.functions import FUNCTIONS, KEPT_READINGS

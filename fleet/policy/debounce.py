@@ -1,7 +1,9 @@
 """Debounces conditions: short changes of their values have no effect. Pure; times in s."""
 
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 HYSTERESIS_S: Final = 1.5
 """Minimum time for which a value must have changed before the change counts."""
@@ -10,8 +12,7 @@ UNKNOWN_TIMEOUT_S: Final = 5.0
 (docs/reference/protocol.md#blocking-times)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Debounced:
+class Debounced(Struct, frozen=True):
     """A condition that counts as true (`on`), or that has become true, but not yet for long enough."""
 
     on: bool
@@ -39,8 +40,7 @@ def debounce(before: Debounced | None, value: bool | None, for_s: float, now: fl
     return replace(before, otherwise_since=since)
 
 
-@dataclass(frozen=True, slots=True)
-class Settled:
+class Settled(Struct, frozen=True):
     """A boolean that changes only after HYSTERESIS_S of the other value."""
 
     value: bool

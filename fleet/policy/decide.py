@@ -26,8 +26,10 @@ dry run, and in a replay of yesterday's recording that asks what another plan wo
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import Decision, DecisionKind
@@ -71,8 +73,7 @@ ATTEMPTS_BEFORE_REPLACEMENT: Final = 2
 """Number of failed mode commands after which another car may take over the role."""
 
 
-@dataclass(frozen=True, slots=True)
-class CarCommand:
+class CarCommand(Struct, frozen=True):
     """A command for one car: a mode, or the color of its LED."""
 
     car: str
@@ -82,8 +83,7 @@ class CarCommand:
     """True if the next command comes soon, so that this one may be dropped while the car is still busy."""
 
 
-@dataclass(frozen=True, slots=True)
-class DecisionStep:
+class DecisionStep(Struct, frozen=True):
     """The decisions about one snapshot. `memory` is for the next step."""
 
     memory: PolicyState

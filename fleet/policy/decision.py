@@ -1,8 +1,10 @@
 """A decision as a value: subject, result, reason, and what would change it. explain.py writes the texts. Pure."""
 
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from schemas.words import Mode
 
@@ -26,8 +28,7 @@ class DecisionKind(StrEnum):
     """A role that no car should have now."""
 
 
-@dataclass(frozen=True, slots=True)
-class Decision:
+class Decision(Struct, frozen=True):
     """The decision about one subject: a car, `role NAME`, or `phase`."""
 
     subject: str

@@ -1,8 +1,9 @@
 """Compares the roles, rules, phases and fixed cars of another plan with those of the plan in force. Pure."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from fleet.policy.plan.plan import Effect, Plan, PlanPhase, Role, Rule
 from schemas.colors import hex_color
@@ -10,8 +11,7 @@ from schemas.colors import hex_color
 _ALL: Final = "all"
 
 
-@dataclass(frozen=True, slots=True)
-class PlanChange:
+class PlanChange(Struct, frozen=True):
     """One part that differs, such as `role guide`, with its fields in both plans. Empty if a plan lacks the part."""
 
     part: str

@@ -4,8 +4,10 @@ tests/vectors/decisions.tsv has an example of each kind of decision.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import LEFT_ALONE, Decision, DecisionKind
@@ -23,8 +25,7 @@ _MAX_REASONS: Final = 4
 """Maximum roles, rules or cars that a reason lists."""
 
 
-@dataclass(frozen=True, slots=True)
-class Override:
+class Override(Struct, frozen=True):
     """A mode that a rule in force gives a car."""
 
     rule: Rule
@@ -225,8 +226,7 @@ def _count(role: Role, allocation: RoleAllocation) -> str:
     return f"{len(allocation.holders(role.name))} of {'all' if role.count is None else allocation.places[role.name]}"
 
 
-@dataclass(frozen=True, slots=True)
-class _Others:
+class _Others(Struct, frozen=True):
     """The cars that do not have a role."""
 
     kinds: tuple[str, ...]

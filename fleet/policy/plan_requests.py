@@ -1,8 +1,9 @@
 """Requests of people for the plan in force: restart, next phase, stop. Pure; times in s."""
 
-from dataclasses import replace
 from enum import StrEnum
 from typing import Final
+
+from msgspec.structs import replace
 
 from fleet.policy.denial_words import fleet_refusal
 from fleet.policy.plan.plan import Plan

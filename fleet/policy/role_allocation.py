@@ -6,8 +6,9 @@ of a role for all cars.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Final, NamedTuple
+
+from msgspec import Struct
 
 from fleet.conditions import Expression
 from fleet.policy.debounce import Settled, settle
@@ -29,8 +30,7 @@ _LINK_DOUBT_COST: Final = 10_000
 """Each of these costs is higher than all lower ones together."""
 
 
-@dataclass(frozen=True, slots=True)
-class Barrier:
+class Barrier(Struct, frozen=True):
     """Reason why a car may not do something, and what would change that."""
 
     why: str
@@ -48,8 +48,7 @@ class PinnedRole(NamedTuple):
     rule: str
 
 
-@dataclass(frozen=True, slots=True)
-class Candidates:
+class Candidates(Struct, frozen=True):
     """The cars that may get roles, and everything that decides which car may have which role."""
 
     plan: Plan
@@ -139,8 +138,7 @@ def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
     return None
 
 
-@dataclass(frozen=True, slots=True)
-class RoleAllocation:
+class RoleAllocation(Struct, frozen=True):
     """The roles of the cars, and the number of places of each role."""
 
     roles: Mapping[str, str]

@@ -1,9 +1,11 @@
 """Follows rules and phases: the rules in force, the car that triggered each, and the phase. Pure; times in s."""
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.policy.debounce import HYSTERESIS_S, Debounced, debounce
 from fleet.policy.plan.plan import (
@@ -27,8 +29,7 @@ _ALL_CARS: Final = ""
 _NO_CARS: Final[Mapping[str, Debounced]] = MappingProxyType({})
 
 
-@dataclass(frozen=True, slots=True)
-class RuleState:
+class RuleState(Struct, frozen=True):
     """The state of one rule."""
 
     on: bool = False
@@ -42,8 +43,7 @@ class RuleState:
     """The readings that triggered the rule, with their values at that time."""
 
 
-@dataclass(frozen=True, slots=True)
-class PhaseState:
+class PhaseState(Struct, frozen=True):
     """The current phase. The name is empty if the plan has no phases."""
 
     name: str = ""
@@ -58,8 +58,7 @@ class PhaseState:
     """Time until the cars settled. The phase's timeout starts then."""
 
 
-@dataclass(frozen=True, slots=True)
-class CarSets:
+class CarSets(Struct, frozen=True):
     """Sets of cars to which a rule may apply."""
 
     subjects: tuple[str, ...]

@@ -5,10 +5,12 @@ observer.py fills the snapshot, decide.py decides by it.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
 from typing import Any, Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.conditions import Expression, aliases_of, compared_in, fields_of
 from fleet.conditions.functions import FUNCTIONS, ConditionFunction, split_call
@@ -25,8 +27,7 @@ def _fields_of(message_class: Any) -> Mapping[str, type]:
     return fields_of(message_class)
 
 
-@dataclass(frozen=True, slots=True)
-class _Field:
+class _Field(Struct, frozen=True):
     """The meaning of a name in an expression: a field of a topic, or a function of that field."""
 
     topic: str
@@ -99,8 +100,7 @@ def is_in(name: str, message: Any) -> bool:
     return _FIELDS[name].is_in(message)
 
 
-@dataclass(frozen=True, slots=True)
-class Refusal:
+class Refusal(Struct, frozen=True):
     """A mode that a car's gateway refused, and why."""
 
     mode: str
@@ -109,8 +109,7 @@ class Refusal:
     at: float
 
 
-@dataclass(frozen=True, slots=True)
-class CarSnapshot:
+class CarSnapshot(Struct, frozen=True):
     """The coordinator's knowledge of one car."""
 
     present: bool = False
@@ -170,8 +169,7 @@ def _profile(platform: str) -> CarProfile | None:
 UNKNOWN_CAR: Final = CarSnapshot()
 
 
-@dataclass(frozen=True, slots=True)
-class FleetSnapshot:
+class FleetSnapshot(Struct, frozen=True):
     """The coordinator's knowledge of all cars."""
 
     cars: Mapping[str, CarSnapshot] = field(default_factory=dict)

@@ -1,8 +1,10 @@
 """The state of the coordinator between decisions, and the part that outlives a change of plan or a restart. Pure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.policy.debounce import HYSTERESIS_S, Debounced, Settled
 from fleet.policy.decision import Decision
@@ -23,8 +25,7 @@ MODE_RETRY_MAX_S: Final = 30.0
 IN_PHASE: Final = "it was so before the coordinator was started again"
 
 
-@dataclass(frozen=True, slots=True)
-class ModeAttempts:
+class ModeAttempts(Struct, frozen=True):
     """The number of commands for one mode of a car, and the time of the next retry."""
 
     mode: str = ""
@@ -37,8 +38,7 @@ class ModeAttempts:
         return ModeAttempts(self.mode, self.count + 1, now + backoff_s(self.count + 1, 1.0, MODE_RETRY_MAX_S))
 
 
-@dataclass(frozen=True, slots=True)
-class HeldRole:
+class HeldRole(Struct, frozen=True):
     """A role that a car has, and how it got that role."""
 
     role: str
@@ -46,8 +46,7 @@ class HeldRole:
     used: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class PersistedPolicy:
+class PersistedPolicy(Struct, frozen=True):
     """The persisted part of the state: roles, phase, and rules in force with the car that triggered each."""
 
     version: str = ""
@@ -63,8 +62,7 @@ class PersistedPolicy:
     """Cars that must still be brought to rest since the plan was stopped."""
 
 
-@dataclass(frozen=True, slots=True)
-class LedRequest:
+class LedRequest(Struct, frozen=True):
     """Notes that a car was commanded to show the color of a rule, after the rule came into force."""
 
     rule: int
@@ -75,8 +73,7 @@ class LedRequest:
     """The car, or None for every car that the coordinator had before its restart."""
 
 
-@dataclass(frozen=True, slots=True)
-class BlinkState:
+class BlinkState(Struct, frozen=True):
     """A blinking LED: its color, whether it is on, and the time of the last change."""
 
     color: Rgb
@@ -84,8 +81,7 @@ class BlinkState:
     at: float
 
 
-@dataclass(frozen=True, slots=True)
-class PolicyState:
+class PolicyState(Struct, frozen=True):
     """Everything that the next decision needs besides the snapshot. Times are seconds on one monotonic clock."""
 
     started_at: float | None = None

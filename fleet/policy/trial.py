@@ -1,7 +1,8 @@
 """A dry run: the first decisions that a plan would make for the cars as they are now. Pure: nothing is commanded."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+
+from msgspec import Struct
 
 from fleet.policy.decide import FIRST_STATE_TIMEOUT_S, step
 from fleet.policy.decision import Decision, DecisionKind
@@ -11,8 +12,7 @@ from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
 from fleet.policy.state import HeldRole, PolicyState, carry_over
 
 
-@dataclass(frozen=True, slots=True)
-class PlanInForce:
+class PlanInForce(Struct, frozen=True):
     """The state of the coordinator now: its plan, the role of each car, and its phase."""
 
     plan: Plan
@@ -20,8 +20,7 @@ class PlanInForce:
     phase: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class CarTrial:
+class CarTrial(Struct, frozen=True):
     """The first decision of a plan about one car, with the car's state before."""
 
     car: str
@@ -41,8 +40,7 @@ class CarTrial:
         return self.role != self.role_before or mode != self.mode_before
 
 
-@dataclass(frozen=True, slots=True)
-class Trial:
+class Trial(Struct, frozen=True):
     """The first decisions of a plan."""
 
     cars: tuple[CarTrial, ...]

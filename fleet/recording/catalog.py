@@ -16,10 +16,11 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
 
 from fleet.recording.left_out import LeftOut
 from fleet.recording.reading.session import NoSession
@@ -283,8 +284,7 @@ _FOLDERS: Final = r"([^/\\]+)[/\\][^/\\]+[/\\][^/\\]+$"
 _SESSION: Final = f"regexp_replace(regexp_extract(filename, '{_FOLDERS}', 1), '^\\.(.*)$', '\\1')"
 
 
-@dataclass(frozen=True, slots=True)
-class _Cast:
+class _Cast(Struct, frozen=True):
     """A column that some files have with another type."""
 
     topic: str

@@ -5,9 +5,10 @@ A module that shows recorded messages counts here those that it does not show. S
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from schemas.printable import printable
 
@@ -32,8 +33,7 @@ class LeftOutCause(StrEnum):
     LONG_ENCODING = "the bus cannot carry its encoding: over 255 bytes"
 
 
-@dataclass(slots=True)
-class LeftOut:
+class LeftOut(Struct):
     """Number of messages by key and cause."""
 
     counts: Counter[tuple[str, LeftOutCause]] = field(default_factory=Counter)

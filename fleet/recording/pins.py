@@ -5,8 +5,10 @@ its session, its first part lies in the session before.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
 from typing import Any, Final, Self
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.recording.time_spec import iso, iso_ns
 from schemas.words import PinCause
@@ -20,8 +22,7 @@ changes. At the limit, a new pin is merged into the newest one of the same cause
 _MS_NS: Final = 1_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Pin:
+class Pin(Struct, frozen=True):
     """A pinned span of time. Times on the recorder's clock, ns since the epoch."""
 
     begin_ns: int
@@ -53,8 +54,7 @@ def minute_of(at_ns: int, cause: PinCause, words: str, cars: Iterable[str] = ())
     return Pin(at_ns - PIN_BEFORE_NS, at_ns + PIN_AFTER_NS, cause, words, tuple(cars))
 
 
-@dataclass(slots=True)
-class PinList:
+class PinList(Struct):
     """The pins of one session. Pins of one cause that touch each other are merged."""
 
     pins: list[Pin] = field(default_factory=list)

@@ -2,17 +2,17 @@
 
 import re
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from typing import Final
+
+from msgspec import Struct
 
 from schemas import keys
 from schemas.commands import COMMANDS
 from schemas.topics import TOPICS
 
 
-@dataclass(frozen=True, slots=True)
-class Selection:
+class Selection(Struct, frozen=True):
     """Selection by keys and by time from `start_ns` (included) to `end_ns` (excluded). None means no limit."""
 
     keys: tuple[str, ...] | None = None

@@ -4,8 +4,9 @@ The recorder uses `SequenceTracker` to request backfills, `sessions verify` uses
 """
 
 from collections.abc import Hashable
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 MAX_TRACKED_SOURCES: Final = 16
 """Maximum number of senders to remember per key. Each `fleet drive` is a new sender."""
@@ -20,8 +21,7 @@ _MODULO: Final = 1 << 32
 _BACKWARD: Final = 1 << 31
 
 
-@dataclass(slots=True)
-class Gap:
+class Gap(Struct):
     """Missing messages `first` to `last`. `PublisherSequence` also sets the receive times before and after the gap."""
 
     first: int
@@ -161,8 +161,7 @@ class SequenceTracker:
         self._first.pop(sender, None)
 
 
-@dataclass(slots=True)
-class PublisherSequence:
+class PublisherSequence(Struct):
     """Tracks the recorded messages of one publisher on one key."""
 
     restarts: bool = False

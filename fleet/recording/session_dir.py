@@ -18,12 +18,13 @@ import shutil
 import socket
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from fnmatch import fnmatch
 from io import FileIO
 from pathlib import Path
 from typing import Any, Final, Self
+
+from msgspec import Struct, field
 
 from fleet.recording.time_spec import format_utc, iso
 from schemas.atomic_file import write_atomically
@@ -55,8 +56,7 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: version(name) for name in _VERSIONED_PACKAGES}}
 
 
-@dataclass(slots=True)
-class SessionInfo:
+class SessionInfo(Struct):
     """Content of `session.json`."""
 
     fleet: str
@@ -98,7 +98,7 @@ class SessionInfo:
             values: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
             if not _is_valid(values):
                 return None
-            return cls(**{name: values[name] for name in cls.__slots__ if name in values})
+            return cls(**{name: values[name] for name in cls.__struct_fields__ if name in values})
         except (OSError, ValueError, TypeError, AttributeError):
             return None
 
@@ -107,7 +107,7 @@ class SessionInfo:
 
         If the disk is full, use the reserved space.
         """
-        values = {name: getattr(self, name) for name in self.__slots__}
+        values = {name: getattr(self, name) for name in self.__struct_fields__}
         try:
             replace(directory / SESSION_FILE, values, indent=2)
         except OSError as error:

@@ -6,10 +6,11 @@ entity of a key is the key itself: `/fleet/red/sensor/range`.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
 from typing import Final
+
+from msgspec import Struct, field
 
 from schemas import keys
 from schemas.battery_levels import CRITICAL_V, LOW_V
@@ -17,8 +18,7 @@ from schemas.topics import CAR_TOPICS, TOPICS, Topic
 from schemas.words import FrameVerdict, Phase
 
 
-@dataclass(frozen=True, slots=True)
-class Curve:
+class Curve(Struct, frozen=True):
     """One number of a topic."""
 
     topic: str
@@ -44,8 +44,7 @@ class Derivation(StrEnum):
     """A line at a battery threshold."""
 
 
-@dataclass(frozen=True, slots=True)
-class StateTrack:
+class StateTrack(Struct, frozen=True):
     """One state of a topic over time. `name` is its component in the .rrd and its label."""
 
     topic: str
@@ -56,8 +55,7 @@ class StateTrack:
     """True if drawings.py derives it from several fields or messages; `field` is the first of them."""
 
 
-@dataclass(frozen=True, slots=True)
-class TextTopic:
+class TextTopic(Struct, frozen=True):
     """A line of text joined from fields in this order, without empty ones."""
 
     topic: str
@@ -69,8 +67,7 @@ class TextTopic:
     """Normal values of `alarm_field`. Any other value makes the line a warning."""
 
 
-@dataclass(frozen=True, slots=True)
-class Panel:
+class Panel(Struct, frozen=True):
     """One view of curves, tracks or lines of text."""
 
     name: str
@@ -271,8 +268,7 @@ TEXT_LINES: Final = (
 """`event/log` needs no row: Rerun reads foxglove.Log as text."""
 
 
-@dataclass(frozen=True, slots=True)
-class Contents:
+class Contents(Struct, frozen=True):
     """Topics of a session by car, and of the fleet's services."""
 
     fleet: str

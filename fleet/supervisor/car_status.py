@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from datetime import UTC
 from typing import Any, Final
 
+from msgspec import Struct
+
 from fleet.client.car_state import CarState
 from fleet.client.claims import CarClaim, motors_claim
 from schemas.keys import name_of
@@ -98,8 +100,7 @@ class CarStatus:
         return "" if essence == before or (before is None and words in _AT_FIRST) else words
 
 
-@dataclass(slots=True)
-class StartProgress:
+class StartProgress(Struct):
     """The progress of a start: the smallest number of missing cars and services so far, and when it was reached."""
 
     fewest: int | None = None

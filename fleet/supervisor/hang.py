@@ -7,9 +7,10 @@ The supervisor kills a process that sends no heartbeat for its `Patience`, unles
 """
 
 from collections import deque
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
+
+from msgspec import Struct, field
 
 MAX_POLL_GAP_S: Final = 0.5
 """Maximum time that counts between two polls of the supervisor. A longer gap means that the supervisor stalled."""
@@ -41,8 +42,7 @@ class Sign(StrEnum):
     SPINNING = "spinning"
 
 
-@dataclass(frozen=True, slots=True)
-class CpuTime:
+class CpuTime(Struct, frozen=True):
     """What the system reports about the CPU time of a process since its start."""
 
     run_s: float
@@ -53,8 +53,7 @@ class CpuTime:
     """True if the process is ready to run or waits for the disk at this moment."""
 
 
-@dataclass(slots=True)
-class Pulse:
+class Pulse(Struct):
     """Samples of the CPU time of one silent process over the last seconds."""
 
     _samples: deque[tuple[float, CpuTime]] = field(default_factory=deque)

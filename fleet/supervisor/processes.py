@@ -6,10 +6,11 @@ import random
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct, field
 
 from fleet.supervisor import cpu_time
 from fleet.supervisor.child import Child, Log
@@ -34,8 +35,7 @@ CPU_CHECK_SILENCE_S: Final = 1.0
 _HEARTBEAT_KINDS: Final = tuple(kind for kind in ProcessKind if kind is not ProcessKind.HUB)
 
 
-@dataclass(slots=True)
-class ManagedProcess:
+class ManagedProcess(Struct):
     """One process, its log and its state."""
 
     name: str

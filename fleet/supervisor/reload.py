@@ -1,8 +1,10 @@
 """Compares the running spec with an edited one: which changes apply now, and which need a restart. Pure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from fleet.supervisor.spec import SIMULATED, CarProcessSpec, CoordinatorCar, FleetSpec
 
@@ -20,8 +22,7 @@ _FIXED_PROPERTIES: Final[Mapping[str, str]] = {
 """Properties that cannot change while the fleet is running, with their names in messages."""
 
 
-@dataclass(frozen=True, slots=True)
-class SpecChange:
+class SpecChange(Struct, frozen=True):
     """The difference of two specs, as far as it can be applied while the fleet is running."""
 
     spec: FleetSpec

@@ -3,10 +3,11 @@
 A car that is switched off is not a failure. Its gateway runs, sends heartbeats, and retries the link by itself.
 """
 
-from dataclasses import dataclass, field
 from enum import StrEnum
 from math import inf
 from typing import Final
+
+from msgspec import Struct, field
 
 from schemas.backoff import backoff_s
 from schemas.limits import SHUTDOWN_S
@@ -37,8 +38,7 @@ class RestartAction(StrEnum):
     KILL = "kill"
 
 
-@dataclass(frozen=True, slots=True)
-class Patience:
+class Patience(Struct, frozen=True):
     """Heartbeat timeouts of a process, s: until the first heartbeat, and between heartbeats."""
 
     start_s: float
@@ -55,8 +55,7 @@ def delay_s(failures: int, chance: float) -> float:
     return backoff_s(failures, FIRST_RESTART_DELAY_S, MAX_RESTART_DELAY_S) * (1 + RESTART_JITTER * (2 * chance - 1))
 
 
-@dataclass(slots=True)
-class ProcessState:
+class ProcessState(Struct):
     """The state machine of one process. `turn` returns the next action, the other methods report what happened."""
 
     patience: Patience

@@ -7,9 +7,11 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, PinRule, default_color, profile_capabilities
 from fleet.fleetfile.fleet_model import PersonRank
@@ -49,8 +51,7 @@ PATIENCE: Final[Mapping[ProcessKind, Patience]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class CarProcessSpec:
+class CarProcessSpec(Struct, frozen=True):
     """One car: its link (or SIMULATED) and further options of its gateway."""
 
     name: str
@@ -59,8 +60,7 @@ class CarProcessSpec:
     arguments: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class CoordinatorCar:
+class CoordinatorCar(Struct, frozen=True):
     """The coordinator's entry for one car in the fleet file."""
 
     platform: str
@@ -70,8 +70,7 @@ class CoordinatorCar:
     """None means any role."""
 
 
-@dataclass(frozen=True, slots=True)
-class FleetSpec:
+class FleetSpec(Struct, frozen=True):
     """Everything that `fleet up` runs."""
 
     fleet: str = DEFAULT_FLEET
@@ -111,8 +110,7 @@ class FleetSpec:
         return [car for car in self.cars.values() if car.link == SIMULATED]
 
 
-@dataclass(frozen=True, slots=True)
-class UpOptions:
+class UpOptions(Struct, frozen=True):
     """The options of `fleet up`. If one is None, the fleet file decides."""
 
     simulated: int = 0

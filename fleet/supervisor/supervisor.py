@@ -11,11 +11,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct
 
 from fleet.client.hints import complete_hints, fleet_options
 from fleet.client.services import why_unrecorded
@@ -71,8 +72,7 @@ _LOGGED_ELSEWHERE: Final = ("log", "decision", "simulator")
 """Events that are in the logs of other processes."""
 
 
-@dataclass(frozen=True, slots=True)
-class SupervisorEvent:
+class SupervisorEvent(Struct, frozen=True):
     """An event that deserves a line. what: `process`, `car`, `hold`, `log`, `decision`, READY, MISSING, ..."""
 
     what: str

@@ -6,8 +6,9 @@ Control decides about each command. Its answer is sent after the writer has had 
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Final
+
+from msgspec.structs import replace
 
 from gateway.bus import command_parser
 from gateway.bus.car_publisher import CarPublisher

@@ -8,8 +8,9 @@ import json
 import math
 import uuid
 from collections.abc import Callable, Iterable
-from dataclasses import fields, replace
 from typing import Any, Final, TypeVar
+
+from msgspec.structs import replace
 
 from gateway.bus.car_service import Request
 from gateway.control.commands import (
@@ -179,7 +180,7 @@ def _action(verb: str, message: Any, car: str, longest_drive_s: float) -> Action
             return Signal(row.verb)
         return Signal(row.verb, _seconds("duration_s", message.duration_s, row.max_duration_s, row.min_duration_s))
     plain = PLAIN_ACTIONS[verb]
-    return plain(**{field.name: getattr(message, field.name) for field in fields(plain)})
+    return plain(**{name: getattr(message, name) for name in plain.__struct_fields__})
 
 
 def _encoding(request: Request) -> str:

@@ -7,9 +7,11 @@ possible here, because `;` separates the parameters of a query.
 import math
 import re
 from collections import deque
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from schemas.topics import HISTORY
 
@@ -35,8 +37,7 @@ class BadRange(ValueError):
     """An invalid `_time` or `last`. Its text shows the correct form."""
 
 
-@dataclass(frozen=True, slots=True)
-class Value:
+class Value(Struct, frozen=True):
     """One published value. `at` is in s, monotonic. `stamp_ns` is its published stamp."""
 
     at: float
@@ -44,8 +45,7 @@ class Value:
     payload: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class Bound:
+class Bound(Struct, frozen=True):
     """One end of a time range: ns since the epoch, or with `from_now`, ns from now."""
 
     ns: int

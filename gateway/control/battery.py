@@ -3,8 +3,10 @@
 A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.measured`).
 """
 
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from schemas.battery_levels import CRITICAL_V, EMPTY_V, FULL_V, LOW_V
 from schemas.words import BatteryAction, BatteryLevel
@@ -21,8 +23,7 @@ LEVEL_DEBOUNCE_S: Final = 5.0
 """Time for which all readings must show another level before the level changes. In mode 0 there is one a second."""
 
 
-@dataclass(frozen=True, slots=True)
-class BatteryPolicy:
+class BatteryPolicy(Struct, frozen=True):
     """The threshold of each level (V at rest, for two cells), and the reaction to each level.
 
     By default no level stops the car. If the voltage gets too low, the car resets, which stops it too.
@@ -54,8 +55,7 @@ class BatteryPolicy:
                 return None
 
 
-@dataclass(slots=True)
-class Battery:
+class Battery(Struct):
     """The level of one car's battery. Times: s, monotonic."""
 
     policy: BatteryPolicy = field(default_factory=BatteryPolicy)

@@ -2,8 +2,9 @@
 
 from collections import OrderedDict, deque
 from collections.abc import Hashable
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from gateway.control.commands import Command
 from gateway.control.control_output import CommandRecord, Later, LogRecord, Record, frame_of
@@ -13,8 +14,7 @@ MAX_COMMAND_IDS: Final = 256
 """Maximum accepted commands whose ids are remembered, to detect duplicates."""
 
 
-@dataclass(slots=True)
-class Pending:
+class Pending(Struct):
     """A command in progress: its arrival time, and the frames that it still needs."""
 
     command: Command

@@ -6,8 +6,9 @@ written.
 
 from collections import deque
 from collections.abc import Hashable, Iterable, Iterator
-from dataclasses import dataclass, field
 from typing import Any
+
+from msgspec import Struct, field
 
 from gateway.control.command_log import CommandLog, Pending
 from gateway.control.holds_and_leases import Safety
@@ -17,8 +18,7 @@ from schemas.rights import Sender
 from schemas.words import Motion, Phase, Reason
 
 
-@dataclass(slots=True)
-class HeldMotion:
+class HeldMotion(Struct):
     """A drive in progress."""
 
     motion: Motion
@@ -49,8 +49,7 @@ class HeldMotion:
             self.expires_at = now + self.duration_s
 
 
-@dataclass(slots=True)
-class CommandQueue:
+class CommandQueue(Struct):
     """At most one motion, at most one mode, and a queue of one-shots. Times: s, monotonic."""
 
     log: CommandLog

@@ -1,16 +1,16 @@
 """The commands that control handles, after parsing and range checks, and their answers. Values only."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import ClassVar, Final
+
+from msgspec import Struct
 
 from schemas.commands import Verb
 from schemas.rights import Sender
 from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, SpeedStep
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(Struct, frozen=True):
     """Hold a motion for `duration_s` seconds. `Motion.STOP` ends the motion that is held.
 
     The time begins when the frame of the motion is written, and in a stream, when a sample arrives.
@@ -22,15 +22,13 @@ class Drive:
     """True: only prolong this motion while the same sender holds it. False: begin it if it is not held."""
 
 
-@dataclass(frozen=True, slots=True)
-class SetMode:
+class SetMode(Struct, frozen=True):
     """Bring the car into a mode. `Mode.MANUAL` closes the open mode."""
 
     mode: Mode
 
 
-@dataclass(frozen=True, slots=True)
-class PartAction:
+class PartAction(Struct, frozen=True):
     """An action on a part of a car: light, servo, arm, speed, fan. It waits in the queue, and needs mode 0.
 
     `needs_lease` is True if it moves a part of the car, or changes how the car moves. Then its sender needs the lease.
@@ -39,8 +37,7 @@ class PartAction:
     needs_lease: ClassVar[bool] = True
 
 
-@dataclass(frozen=True, slots=True)
-class Led(PartAction):
+class Led(PartAction, frozen=True):
     """Set the color LED, 0..255 each."""
 
     r: int
@@ -49,16 +46,14 @@ class Led(PartAction):
     needs_lease: ClassVar[bool] = False
 
 
-@dataclass(frozen=True, slots=True)
-class SetLight(PartAction):
+class SetLight(PartAction, frozen=True):
     """Switch the light."""
 
     light: Light
     needs_lease: ClassVar[bool] = False
 
 
-@dataclass(frozen=True, slots=True)
-class Signal(PartAction):
+class Signal(PartAction, frozen=True):
     """Give the signal of a verb, such as a beep, once or for `duration_s` seconds (see `CommandType.signal`)."""
 
     verb: Verb
@@ -66,56 +61,48 @@ class Signal(PartAction):
     needs_lease: ClassVar[bool] = False
 
 
-@dataclass(frozen=True, slots=True)
-class MoveServo(PartAction):
+class MoveServo(PartAction, frozen=True):
     """Move a servo by one step, or to its middle."""
 
     action: ServoAction
 
 
-@dataclass(frozen=True, slots=True)
-class AimServo(PartAction):
+class AimServo(PartAction, frozen=True):
     """Turn the front servo to an angle, 0..180 degrees, in the direction in which the car counts them."""
 
     deg: int
 
 
-@dataclass(frozen=True, slots=True)
-class MoveArm(PartAction):
+class MoveArm(PartAction, frozen=True):
     """Move the six joints of an arm, 0..180 degrees each."""
 
     joint_deg: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class ChangeSpeed(PartAction):
+class ChangeSpeed(PartAction, frozen=True):
     """Change the car's relative speed by one step."""
 
     step: SpeedStep
 
 
-@dataclass(frozen=True, slots=True)
-class Fan(PartAction):
+class Fan(PartAction, frozen=True):
     """Toggle the fan, or switch it on or off. To switch it, its current state must be known."""
 
     on: bool | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(Struct, frozen=True):
     """Stop the car. Put it on hold, unless the coordinator is the sender."""
 
 
-@dataclass(frozen=True, slots=True)
-class EmergencyStop:
+class EmergencyStop(Struct, frozen=True):
     """Stop the car, and refuse commands until a resume with this id. If `fleet_wide`, all gateways latch it."""
 
     why: str = ""
     fleet_wide: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Resume:
+class Resume(Struct, frozen=True):
     """End the e-stops with these ids. Without ids, end the hold. With `all`, end the hold and all e-stops.
 
     Only what the sender may end is ended.
@@ -125,40 +112,34 @@ class Resume:
     all: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Pause:
+class Pause(Struct, frozen=True):
     """Stop the car, and let only leads move the cars of the fleet until an `Unpause`."""
 
     why: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Unpause:
+class Unpause(Struct, frozen=True):
     """End the pause of the fleet. Move nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class Lend:
+class Lend(Struct, frozen=True):
     """Lend the car to a person for `duration_s` seconds: meanwhile no other person, except leads, may drive it."""
 
     to: str
     duration_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class EndLoan:
+class EndLoan(Struct, frozen=True):
     """End the loan of the car."""
 
 
-@dataclass(frozen=True, slots=True)
-class TakeLease:
+class TakeLease(Struct, frozen=True):
     """Reserve the car for the sender for a short time, or end its lease."""
 
     release: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Find:
+class Find(Struct, frozen=True):
     """Make the car blink, and beep if it can, without moving it."""
 
 
@@ -175,8 +156,7 @@ PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {
 """Actions, by verb, whose fields are flags of the message. They need no parsing rules."""
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(Struct, frozen=True):
     """One command, parsed and in range."""
 
     id: str
@@ -196,8 +176,7 @@ class Command:
     """True for a sample of a stream: it gets no answer, and repetitions share one record."""
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Struct, frozen=True):
     """The immediate answer to the sender. `status` is sent, queued or rejected."""
 
     status: Phase

@@ -1,14 +1,14 @@
 """The output of control: records of commands, log records, and frames to write. Values only."""
 
-from dataclasses import dataclass
 from typing import Any
+
+from msgspec import Struct
 
 from gateway.control.commands import Command
 from schemas.words import FrameOrigin, Level, Phase, Reason
 
 
-@dataclass(frozen=True, slots=True)
-class CommandRecord:
+class CommandRecord(Struct, frozen=True):
     """One transition in the life of a command."""
 
     command: Command
@@ -24,8 +24,7 @@ class CommandRecord:
     """`shown` or `sent`, in the last record of a stop."""
 
 
-@dataclass(frozen=True, slots=True)
-class LogRecord:
+class LogRecord(Struct, frozen=True):
     """One log record. `code` is one word for machines, `words` are for a person."""
 
     level: Level
@@ -37,8 +36,7 @@ class LogRecord:
 Record = CommandRecord | LogRecord
 
 
-@dataclass(frozen=True, slots=True)
-class Later:
+class Later(Struct, frozen=True):
     """A frame of an action, with a delay before it. Other commands can be sent during the delay."""
 
     frame: Any
@@ -51,8 +49,7 @@ def frame_of(given: Any) -> Any:
     return given.frame if isinstance(given, Later) else given
 
 
-@dataclass(frozen=True, slots=True)
-class OutgoingFrame:
+class OutgoingFrame(Struct, frozen=True):
     """One frame to write now, in a single write."""
 
     frame: Any

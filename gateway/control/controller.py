@@ -5,8 +5,9 @@ calls the `driver` directly (see gateway/control/driver.py).
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from typing import Final, Generic, TypeVar, assert_never
+
+from msgspec.structs import replace
 
 from gateway.control import refusals
 from gateway.control.battery import BatteryPolicy

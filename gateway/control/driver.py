@@ -14,8 +14,9 @@ Times: s of one monotonic clock. `docs/how-to/write-a-driver.md` explains a whol
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
+
+from msgspec import Struct, field
 
 from gateway.control.battery import Battery, BatteryPolicy
 from gateway.control.command_log import CommandLog, Pending
@@ -66,16 +67,14 @@ class Event(Protocol):
         """When the last byte arrived, s, monotonic."""
 
 
-@dataclass(frozen=True, slots=True)
-class Echo:
+class Echo(Struct, frozen=True):
     """Bytes that equal a frame which we sent shortly before. `at` is the time of the last byte."""
 
     raw: bytes
     at: float
 
 
-@dataclass(frozen=True, slots=True)
-class Rejected:
+class Rejected(Struct, frozen=True):
     """Bytes that are not a reading, with the cause. `detail` is for a person; `at` is the time of the last byte."""
 
     raw: bytes
@@ -84,8 +83,7 @@ class Rejected:
     detail: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class TextLine:
+class TextLine(Struct, frozen=True):
     """A whole line of text between frames, such as a debug print, with its line end. It does not count as damage.
 
     It may be in a longer run of unreadable bytes. `at` is the time of the last byte of that run.
@@ -138,8 +136,7 @@ class ModeClaims(Protocol):
         """True if the readings show that the car is no longer in the commanded mode."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outputs:
+class Outputs(Struct, frozen=True):
     """The estimated state of the parts that the gateway sets. None if unknown, or if the car has no such part."""
 
     speed: float = 0.0
@@ -148,8 +145,7 @@ class Outputs:
     servo_deg: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Findings:
+class Findings(Struct, frozen=True):
     """The findings about the car itself, for `state/health`."""
 
     platform_evidence: tuple[str, ...] = ()
@@ -266,8 +262,7 @@ def log_unstopped(log: CommandLog, car: str, why: str, now: float) -> None:
 # ---------------------------------------------------------------------- the driver
 
 
-@dataclass(frozen=True, slots=True)
-class Desk:
+class Desk(Struct, frozen=True):
     """The objects that a gateway shares with its driver. Commands wait in `queue` until the driver can send them."""
 
     car: str

@@ -4,8 +4,10 @@
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
 from typing import Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from schemas.rights import Estop, FleetPause, Hold, LeaseState, Loan, Sender, strength
 from schemas.words import Rank
@@ -24,8 +26,7 @@ MAX_ENDED_PAUSES: Final = 2 * MAX_PAUSES
 """Maximum ended pauses that are remembered."""
 
 
-@dataclass(frozen=True, slots=True)
-class PersistedSafety:
+class PersistedSafety(Struct, frozen=True):
     """The part of the safety state that survives a restart."""
 
     hold: Hold | None = None
@@ -36,8 +37,7 @@ class PersistedSafety:
     loan: Loan | None = None
 
 
-@dataclass(slots=True)
-class Safety:
+class Safety(Struct):
     """Hold, e-stops, pauses, loan and lease of one car."""
 
     hold: Hold | None = None

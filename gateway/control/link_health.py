@@ -1,8 +1,9 @@
 """Rates the link by the bytes from the car, and never by a library's claim that it is connected."""
 
 from collections import deque
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from schemas.words import LinkState
 
@@ -13,8 +14,7 @@ STALE_S: Final = 3.0
 normal."""
 
 
-@dataclass(slots=True)
-class LinkHealth:
+class LinkHealth(Struct):
     """State and counters of one link. Times: s, monotonic."""
 
     state: LinkState = LinkState.LOST

@@ -3,8 +3,9 @@
 Pure: it gets the context of the car and returns a refusal or None. A stop or e-stop is never refused.
 """
 
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.control.commands import (
     Action,
@@ -37,8 +38,7 @@ AFTER_SLEEP_S: Final = 2.0
 """For this long after a sleep of the computer, a command without `asked` may be from before the sleep."""
 
 
-@dataclass(frozen=True, slots=True)
-class CommandContext:
+class CommandContext(Struct, frozen=True):
     """The state of car and gateway on which the decision about a command depends."""
 
     car: str
@@ -62,8 +62,7 @@ class CommandContext:
     """When the last sleep of the computer was noticed."""
 
 
-@dataclass(frozen=True, slots=True)
-class Needs:
+class Needs(Struct, frozen=True):
     """The conditions for a command."""
 
     right: Right | None = Right.ACT

@@ -1,7 +1,8 @@
 """Tracks senders: lost liveliness tokens, and senders of drives that must be silent after a stop."""
 
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from schemas.limits import STREAM_SILENCE_S
 
@@ -11,8 +12,7 @@ MAX_SENDERS: Final = 256
 """Maximum senders whose last drive is remembered."""
 
 
-@dataclass(slots=True)
-class Senders:
+class Senders(Struct):
     """Tokens and drive streams, by name of the sender. Times: s, monotonic."""
 
     _tokens: dict[str, float | None] = field(default_factory=dict)

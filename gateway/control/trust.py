@@ -23,9 +23,10 @@ they know the rhythm of this car; here it is one more row of a table. `TRANSITIO
 event, so no combination is forgotten, and a test walks through all of them.
 """
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
+
+from msgspec import Struct
 
 from schemas.words import Basis, CarTrust, Motors
 
@@ -101,8 +102,7 @@ _MOTORS: Final = {
 }
 
 
-@dataclass(slots=True)
-class TrustState:
+class TrustState(Struct):
     """The current state, since when, and why. Times: s, monotonic."""
 
     state: CarTrust = CarTrust.UNKNOWN

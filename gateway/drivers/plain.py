@@ -15,8 +15,9 @@ seconds, because its frames may have been lost.
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import ClassVar, Final
+
+from msgspec import Struct, field
 
 from gateway.control.battery import Battery
 from gateway.control.command_log import Pending
@@ -66,8 +67,7 @@ _STEPS: Final[Mapping[SpeedStep, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.
 # ---------------------------------------------------------------------- the claims
 
 
-@dataclass(slots=True)
-class PlainMode:
+class PlainMode(Struct):
     """The claims about the mode of a car that has only one."""
 
     asked: Mode | None = Mode.MANUAL
@@ -80,8 +80,7 @@ class PlainMode:
     is_over: bool = False
 
 
-@dataclass(slots=True)
-class PlainModel:
+class PlainModel(Struct):
     """The claims about a car. Times: s, monotonic."""
 
     name: str
@@ -163,8 +162,7 @@ class PlainModel:
 # ---------------------------------------------------------------------- the driver
 
 
-@dataclass(slots=True)
-class PlainStop:
+class PlainStop(Struct):
     """A stop in progress. Times: s, monotonic."""
 
     why: FrameOrigin

@@ -1,12 +1,11 @@
 """The profile of cars of a plain family. It has a module of its own, because the driver loads slowly. Pure."""
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 from schemas.words import CAPABILITIES, Light, Mode, ServoAction
 
 
-@dataclass(frozen=True, slots=True)
-class PlainProfile:
+class PlainProfile(Struct, frozen=True):
     """What cars of one platform can do: a `CarProfile` without modes."""
 
     name: str

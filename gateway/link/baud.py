@@ -5,8 +5,9 @@ several times, so its bytes consist of long runs of equal bits: 00, 80, E0, F8, 
 samples slower sees several bits as one, and its bytes are arbitrary.
 """
 
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from schemas.links import LinkUrl
 
@@ -24,8 +25,7 @@ _RUNS: Final = frozenset(
 """The bytes with at most two runs of equal bits."""
 
 
-@dataclass(frozen=True, slots=True)
-class BaudDoubt:
+class BaudDoubt(Struct, frozen=True):
     """Why the baud rate may be wrong. `cause` is the word under which it is counted: `wrong_baud` or `no_frames`."""
 
     cause: str

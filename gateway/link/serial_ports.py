@@ -2,9 +2,10 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
 
 from gateway.link.usb import list_ports
 from schemas.links import LinkUrl, SerialUrl, UsbUrl
@@ -15,8 +16,7 @@ if TYPE_CHECKING:
 BY_ID: Final = Path("/dev/serial/by-id")
 
 
-@dataclass(frozen=True, slots=True)
-class SerialPort:
+class SerialPort(Struct, frozen=True):
     """A serial port of this computer. `url` is its most stable URL. vid and pid: four hexadecimal digits."""
 
     device: str

@@ -3,8 +3,9 @@
 import os
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
+
+from msgspec import Struct
 
 from gateway.link.link_errors import CannotOpen
 from schemas.links import SerialUrl, UsbUrl
@@ -18,8 +19,7 @@ LIST_ATTEMPTS: Final = 3
 LIST_RETRY_DELAY_S: Final = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class UsbSerialPort:
+class UsbSerialPort(Struct, frozen=True):
     """A serial port of this computer. vid, pid and serial are set only for a USB device that reports them."""
 
     device: str

@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import Any, Final
+
+from msgspec.structs import replace
 
 from gateway.sim.model.stm32 import STM32_TRAITS
 from gateway.sim.model.traits import CarTraits

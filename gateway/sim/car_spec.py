@@ -2,8 +2,9 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.sim.car_options import BadOption, parse_traits
 from gateway.sim.model.factory import PLATFORMS
@@ -18,8 +19,7 @@ class BadSpec(ValueError):
     """A description that is not allowed. The message names the place and the value, and says what is allowed."""
 
 
-@dataclass(frozen=True, slots=True)
-class PtyPath:
+class PtyPath(Struct, frozen=True):
     """A pseudo terminal.
 
     At `path`, the simulator makes a symlink to it. The symlink has the same name again when a lost link returns, while
@@ -29,16 +29,14 @@ class PtyPath:
     path: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class TcpListen:
+class TcpListen(Struct, frozen=True):
     """A listening TCP port. With port 0, the system chooses a free one."""
 
     host: str = "127.0.0.1"
     port: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class CarSpec:
+class CarSpec(Struct, frozen=True):
     """One simulated car."""
 
     name: str
@@ -55,8 +53,7 @@ class CarSpec:
         return "+".join((self.platform, *sorted(self.options)))
 
 
-@dataclass(frozen=True, slots=True)
-class ReplaySpec:
+class ReplaySpec(Struct, frozen=True):
     """A capture of `gateway monitor --raw` that is played as a car."""
 
     name: str

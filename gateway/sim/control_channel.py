@@ -6,8 +6,9 @@ import os
 import signal
 import sys
 import threading
-from dataclasses import asdict
 from typing import Final
+
+from msgspec import to_builtins
 
 from gateway.sim.car_spec import BadSpec
 from gateway.sim.endpoints import EndpointError
@@ -102,5 +103,5 @@ def _truth(simulation: Simulation, name: object) -> dict[str, object]:
         assert isinstance(capture, CaptureCar)
         fields = {"sent_bytes": capture.sent_bytes, "ignored_bytes": capture.ignored_bytes, "rounds": capture.rounds}
     else:
-        fields = {**asdict(truth), **pose._asdict()}
+        fields = {**to_builtins(truth), **pose._asdict()}
     return {"ok": True, "car": name, **fields, "lost_bytes": car.lost_bytes}

@@ -6,9 +6,10 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec
 from gateway.sim.model.faulty_link import Direction, Flood
@@ -38,8 +39,7 @@ class FaultKind(StrEnum):
     EMPTY = "empty"
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(Struct, frozen=True):
     """One fault. Without `car` it hits every car. A kind ignores the fields that `_FIELDS` does not list for it."""
 
     kind: FaultKind
@@ -64,16 +64,14 @@ class Fault:
     """New path of a renamed pseudo terminal. None means that the path stays and leads to another device."""
 
 
-@dataclass(frozen=True, slots=True)
-class Press:
+class Press(Struct, frozen=True):
     """A press of a button of the remote. Without `car` it is sent to every car."""
 
     button: Button
     car: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Scheduled:
+class Scheduled(Struct, frozen=True):
     """A fault or press of the command line, with its time after the start."""
 
     at_s: float

@@ -5,8 +5,9 @@ Distances in meters, speeds in m/s, angles in the file in degrees counter-clockw
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from math import radians
+
+from msgspec import Struct
 
 from gateway.sim.model.firmware import Pose
 from gateway.sim.model.objects import Lamp, MovingObject
@@ -16,8 +17,7 @@ from schemas.world_check import check_world, walls_of
 from schemas.world_fields import LineEntry, ThingEntry
 
 
-@dataclass(frozen=True, slots=True)
-class WorldSpec:
+class WorldSpec(Struct, frozen=True):
     """The content of a world file. A World changes while it runs, so each run creates a new one from this."""
 
     walls: tuple[Segment, ...]

@@ -3,7 +3,8 @@
 import asyncio
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+
+from msgspec import Struct, field
 
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.frames import encode
@@ -19,8 +20,7 @@ from gateway.tools.statistics import LinkStatistics
 from schemas.words import LinkVerdict, Mode, Platform
 
 
-@dataclass(slots=True)
-class LinkProbe:
+class LinkProbe(Struct):
     """One link with its statistics and its verdict."""
 
     url: LinkUrl

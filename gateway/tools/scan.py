@@ -9,8 +9,9 @@ import json
 import sys
 import time
 from collections.abc import Coroutine, Iterator, Sequence
-from dataclasses import asdict
 from typing import Any, Final
+
+from msgspec import to_builtins
 
 from gateway.drivers.yahboom.protocol.frames import encode
 from gateway.drivers.yahboom.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
@@ -167,7 +168,7 @@ class _Scan:
     def fields(self) -> Iterator[dict[str, Any]]:
         """Yield one object for each link and device."""
         for probe in self._probes:
-            named = {"device": None} if probe.port is None else asdict(probe.port)
+            named = {"device": None} if probe.port is None else to_builtins(probe.port)
             url = str(probe.url) if probe.port is None else probe.port.url
             yield {
                 "kind": "link" if probe.port is None else "serial",

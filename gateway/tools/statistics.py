@@ -2,8 +2,9 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
+
+from msgspec import Struct, field
 
 from gateway.control.driver import Echo, Rejected, TextLine
 from gateway.drivers.yahboom.estimate.platform import PlatformDetector
@@ -15,8 +16,7 @@ from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuR
 from schemas.words import FrameVerdict, Platform
 
 
-@dataclass(slots=True)
-class LinkStatistics:
+class LinkStatistics(Struct):
     """Counts of the events of one link. Times are in seconds since the start."""
 
     since: float | None = None

@@ -5,9 +5,8 @@ Nothing is checked here, so use it only for certificates in our own directory, w
 
 import binascii
 import re
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 RENEWED_SHARE: Final = 1 / 3
 """Share of a certificate's life that is left when it is renewed."""
@@ -17,8 +16,7 @@ _TIME: Final = rb"(?:\x17\x0d(\d{12}Z)|\x18\x0f(\d{14}Z))"
 _VALIDITY: Final = re.compile(rb"\x30[\x1e-\x22]" + _TIME + _TIME)
 
 
-@dataclass(frozen=True, slots=True)
-class CertificateDates:
+class CertificateDates(NamedTuple):
     """When a certificate begins and ends."""
 
     begins: datetime

@@ -7,10 +7,9 @@ identity of its sender in its key, so a gateway knows who sent it.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 from schemas.atomic_file import write_atomically
 from schemas.bus.certificate_dates import CertificateDates
@@ -39,8 +38,7 @@ class NoCredentials(BusError):
     """This computer has no certificate for a hub. The text says how to get one."""
 
 
-@dataclass(frozen=True, slots=True)
-class Credentials:
+class Credentials(NamedTuple):
     """The files for one hub."""
 
     directory: Path

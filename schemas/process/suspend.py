@@ -13,9 +13,10 @@ pause of a virtual machine is not noticed either, because no clock of its system
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Final
+
+from msgspec import Struct
 
 if sys.platform == "win32":
     import ctypes
@@ -63,8 +64,7 @@ def clock_pair() -> ClockPair | None:
     return with_sleep, awake
 
 
-@dataclass(slots=True)
-class _Reading:
+class _Reading(Struct):
     """Bounds of the time that the computer has slept since its start, s."""
 
     at_least: float

@@ -10,11 +10,11 @@ import re
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import yaml
+from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, ValidationError
 from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
 
@@ -40,8 +40,7 @@ _COLOR_COMMENT: Final = re.compile(r"[:,[][ \t]*(#[0-9A-Fa-f]{6})\b")
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Problem:
+class Problem(Struct, frozen=True, order=True):
     """One fault of a file. `line` and `column` count from 1; both are 0 if there is no file. `field` may be empty."""
 
     line: int

@@ -1,7 +1,8 @@
 """Time of one decision of the coordinator for 50 cars and 20 rules. The floor only reads the readings of each rule."""
 
-from dataclasses import replace
 from time import perf_counter
+
+from msgspec.structs import replace
 
 from fleet.policy.decide import step
 from fleet.policy.plan.plan_parser import parse

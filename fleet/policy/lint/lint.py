@@ -5,9 +5,11 @@ one, against cars of any platform.
 """
 
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from fleet.conditions.satisfiability import explain_impossible
 from fleet.policy.debounce import HYSTERESIS_S
@@ -32,8 +34,7 @@ class Severity(StrEnum):
     """This part of the plan works, but probably not as intended."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlanFault:
+class PlanFault(Struct, frozen=True):
     """One fault of a plan: the part, what is wrong with it, and what to do. line, column: position of the part."""
 
     severity: Severity
@@ -50,8 +51,7 @@ class PlanFault:
         return f"{source}:{self.line}:{self.column}: {self.severity}: {self}"
 
 
-@dataclass(frozen=True, slots=True)
-class Faults:
+class Faults(Struct, frozen=True):
     """The faults of a plan. The coordinator refuses a plan with errors."""
 
     errors: tuple[PlanFault, ...] = ()

@@ -4,9 +4,10 @@ Which readings a car measures depends on its mode (docs/reference/protocol.md#pl
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cache
 from typing import Final
+
+from msgspec import Struct
 
 from fleet.conditions import Expression, is_contradictory
 from fleet.conditions.expression import And, Compare, Literal, Name, Node, Not, Or
@@ -55,8 +56,7 @@ def _assume(node: Node, names: frozenset[str], *, value: bool) -> Node:
     return node
 
 
-@dataclass(frozen=True, slots=True)
-class Outlook:
+class Outlook(Struct, frozen=True):
     """Says whether a condition can be true. If both texts are empty, it can be true for any car."""
 
     never: str = ""

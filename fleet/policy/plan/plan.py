@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
+from msgspec import Struct
+
 from fleet.conditions import Expression
 from schemas.colors import Rgb
 from schemas.words import Mode
@@ -83,8 +85,7 @@ class Role:
         object.__setattr__(self, "needs_text", "" if self.needs is None else str(self.needs))
 
 
-@dataclass(frozen=True, slots=True)
-class Effect:
+class Effect(Struct, frozen=True):
     """A role, mode or color that a rule gives to some cars, or the phase that a rule begins."""
 
     who: str = ""
@@ -96,8 +97,7 @@ class Effect:
     phase: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Rule:
+class Rule(Struct, frozen=True):
     """Effects that are in force while `when` is true. With `until`, they stay in force until `until` is true."""
 
     name: str
@@ -107,8 +107,7 @@ class Rule:
     during: frozenset[str] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class PlanPhase:
+class PlanPhase(Struct, frozen=True):
     """A part of the job."""
 
     name: str

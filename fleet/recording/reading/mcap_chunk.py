@@ -4,7 +4,7 @@ The mcap library is not used for this: it allocates as much as a damaged length 
 """
 
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from io import BytesIO
 from typing import IO, Final
 
@@ -15,6 +15,7 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
 from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from msgspec import Struct
 
 from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES
 
@@ -31,8 +32,7 @@ Record = tuple[int, int, int, int, bytes]
 body."""
 
 
-@dataclass(frozen=True, slots=True)
-class Damage:
+class Damage(Struct, frozen=True):
     """One corrupted or missing part of a file."""
 
     at: int
@@ -43,8 +43,7 @@ class Damage:
         return f"byte {self.at}: {self.words}"
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkPart:
+class ChunkPart(Struct, frozen=True):
     """The bytes of a chunk, or of one record in a file without chunks."""
 
     at: int

@@ -6,7 +6,6 @@ of chunks has millions of entries. Here, a table stays unparsed until `may_conta
 
 import struct
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from io import BytesIO
 from typing import IO, Final
 
@@ -14,6 +13,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema, Statistics
+from msgspec import Struct, field
 
 MAX_RECORD_BYTES: Final = 80 * 2**20
 """Maximum size of a record and of a decompressed chunk to read.
@@ -27,8 +27,7 @@ _EXTRA_INDEX: Final = struct.Struct("<QQ")  # offset, length of an attachment or
 _CHANNEL_ENTRY: Final = struct.Struct("<HQ")  # of that table: channel, offset of its message index
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkPlace:
+class ChunkPlace(Struct, frozen=True):
     """Position and time span of one chunk."""
 
     at: int
@@ -42,8 +41,7 @@ class ChunkPlace:
         return not self.table or any(channel in channels for channel, _ in _CHANNEL_ENTRY.iter_unpack(self.table))
 
 
-@dataclass(slots=True)
-class Index:
+class Index(Struct):
     """Chunks in the order of the file, schemas and channels by id, and statistics."""
 
     chunks: list[ChunkPlace] = field(default_factory=list)

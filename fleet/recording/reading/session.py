@@ -8,12 +8,12 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from copy import copy
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, overload
 
 from mcap.records import Metadata
+from msgspec import Struct
 
 from fleet.client.reading import Reading
 from fleet.recording import session_dir
@@ -61,8 +61,7 @@ def _near(path: Path) -> str:
     return near and f"{near} "
 
 
-@dataclass(frozen=True, slots=True)
-class Recorded:
+class Recorded(Struct, frozen=True):
     """One message of a session, with its payload as on the bus."""
 
     key: str

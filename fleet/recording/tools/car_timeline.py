@@ -1,8 +1,9 @@
 """Lists what happened to one car around one time of a session: commands, records, claims and decisions. Pure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.client.claims import link_claim, mode_claim, motors_claim
 from fleet.recording.tools.stop_findings import StopFindings, UnshownStop, asked_by
@@ -23,8 +24,7 @@ _CLAIMS: Final = {
 TIMELINE_TOPICS: Final = (*_CLAIMS, "state/health", "event/command", "event/log")
 
 
-@dataclass(frozen=True, slots=True)
-class TimelineEntry:
+class TimelineEntry(Struct, frozen=True):
     """One line of the timeline."""
 
     at_ns: int
@@ -34,8 +34,7 @@ class TimelineEntry:
         return f"{clock(self.at_ns / 1e9)}  {self.words}"
 
 
-@dataclass(slots=True)
-class CarTimeline:
+class CarTimeline(Struct):
     """The timeline of one car from `begin_ns` to `end_ns`."""
 
     car: str

@@ -6,8 +6,9 @@ counts as true, unless a value that the condition needs became stale in between.
 """
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from fleet.conditions import Expression
 from fleet.conditions.holding import HeldSpan
@@ -29,8 +30,7 @@ MODE: Final = TOPICS["state/mode"]
 COMMANDS: Final = TOPICS["event/command"]
 
 
-@dataclass(frozen=True, slots=True)
-class Hit:
+class Hit(Struct, frozen=True):
     """A time during which a condition held for one car.
 
     Times: of the first and last reading, by the recorder's clock, ns since the epoch.
@@ -95,8 +95,7 @@ class ConditionRun:
             self.hits.append(Hit(self._car, begin_ns, end_ns, *self._at_begin))
 
 
-@dataclass(slots=True)
-class Found:
+class Found(Struct):
     """The hits of one session, and what was left out."""
 
     hits: list[Hit]

@@ -9,9 +9,10 @@ A stop begins when it arrived, and ends with its last event.
 
 from collections import deque
 from collections.abc import Container, Iterator
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.recording.tools.stop_findings import asked_by
 from schemas import keys
@@ -48,8 +49,7 @@ class Lane(StrEnum):
     LOSS = "loss"
 
 
-@dataclass(slots=True)
-class LaneSpan:
+class LaneSpan(Struct):
     """A mode, driver, hold, stop or loss from `begin_ns` to `end_ns`. The end grows while it lasts."""
 
     car: str
@@ -64,8 +64,7 @@ class LaneSpan:
         return [self.car, self.lane, self.begin_ns // 1_000_000, self.end_ns // 1_000_000, self.words, self.bad]
 
 
-@dataclass(frozen=True, slots=True)
-class LaneMark:
+class LaneMark(Struct, frozen=True):
     """A mark that somebody set."""
 
     at_ns: int
@@ -73,8 +72,7 @@ class LaneMark:
     by: str = ""
 
 
-@dataclass(slots=True)
-class Lanes:
+class Lanes(Struct):
     """The lanes of all cars, from their messages in the order of their times."""
 
     spans: dict[tuple[str, Lane], deque[LaneSpan]] = field(default_factory=dict)

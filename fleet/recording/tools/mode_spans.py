@@ -5,8 +5,10 @@ no rows at all from obstacle avoidance, and nobody would notice that they are mi
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
 from typing import Any, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from gateway import drivers
 from schemas.topics import FROM_OUTSIDE, TOPICS
@@ -18,8 +20,7 @@ _HOLDS_NS: Final = round(MODE.stale_after_s * 1e9)
 """A state lasts until the next one, or until it is stale."""
 
 
-@dataclass(frozen=True, slots=True)
-class ModeSpan:
+class ModeSpan(Struct, frozen=True):
     """A time during which a car was in one mode. Times: ns since the epoch, of the publisher's clock."""
 
     car: str

@@ -8,10 +8,10 @@ it is old.
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, Final
 
 from google.protobuf.message import DecodeError
+from msgspec import Struct
 
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import message_of
@@ -23,8 +23,7 @@ from schemas import keys, messages
 from schemas.topics import TOPICS
 
 
-@dataclass(frozen=True, slots=True)
-class Known:
+class Known(Struct, frozen=True):
     """A message that was known. Times: ns, by the recorder's and by the publisher's clock."""
 
     key: keys.Key

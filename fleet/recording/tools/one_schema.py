@@ -6,9 +6,10 @@ times, sequences, attachments and metadata are those of the session.
 
 from collections.abc import Iterable
 from copy import copy
-from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
+
+from msgspec import Struct, field
 
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_copy import McapCopy
@@ -21,8 +22,7 @@ _Schema = tuple[str | bytes, ...]
 """Encoding of the messages, then name, encoding and data of their schema if there is one."""
 
 
-@dataclass(slots=True)
-class TopicNames:
+class TopicNames(Struct):
     """Names topics for Foxglove, so that each has one schema. Used for sessions and for a live fleet."""
 
     schemas: dict[str, _Schema] = field(default_factory=dict)
@@ -50,7 +50,6 @@ class TopicNames:
         return next(name for name in names if self.schemas.setdefault(name, found) == found)
 
 
-@dataclass(slots=True)
 class OneSchema(TopicNames):
     """Counts and topics of a written file."""
 

@@ -12,9 +12,10 @@ the clock was set back, or if the recorder was away.
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Generic, TypeVar
+
+from msgspec import Struct
 
 from fleet.conditions.holding import CLOCK_STEP_S
 
@@ -24,8 +25,7 @@ _SAME_CLOCK_NS: Final = 1_000_000_000
 Item = TypeVar("Item")
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedMessage(Generic[Item]):
+class RecordedMessage(Struct, Generic[Item], frozen=True):
     """A recorded message. Times: ns since the epoch."""
 
     log_ns: int

@@ -11,12 +11,12 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from google.protobuf.message import Message
+from msgspec import Struct, field
 
 from fleet.recording.left_out import LeftOut
 from fleet.recording.reading.mcap_reader import Row
@@ -243,8 +243,7 @@ def topic_name(key: str) -> str:
     return "/" + "/".join(f"n{word}" if word[0].isdigit() else word for word in words)
 
 
-@dataclass(slots=True)
-class Bag:
+class Bag(Struct):
     """Counts and topics of a written bag."""
 
     messages: int = 0

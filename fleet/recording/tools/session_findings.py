@@ -2,8 +2,9 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field, to_builtins
 
 from fleet.client.diagnosis import DoctorFinding
 from fleet.recording.reading.mcap_reader import Row
@@ -24,8 +25,7 @@ from schemas.words import Basis, Phase
 _REFUSED_PHASES: Final = (Phase.REJECTED, Phase.FAILED)
 
 
-@dataclass(slots=True)
-class SessionCheckup:
+class SessionCheckup(Struct):
     """Counts of one session, by car."""
 
     stops: Counter[str] = field(default_factory=Counter)
@@ -107,7 +107,7 @@ class SessionCheckup:
 
     def as_dict(self, verdict: SessionVerdict, name: str) -> dict[str, Any]:
         """Return the findings and the facts, for JSON."""
-        found = [asdict(finding) for finding in self.findings(verdict, name)]
+        found = [to_builtins(finding) for finding in self.findings(verdict, name)]
         stops = [each.as_dict() for each in self.unshown.stops]
         return {"session": verdict.session, "findings": found, "facts": dict(self.facts(verdict)), "stops": stops}
 

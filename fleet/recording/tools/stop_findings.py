@@ -6,8 +6,9 @@ in doubt, or a car whose reports cannot show a stop.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.client.claims import claims_of
 from schemas import messages
@@ -25,8 +26,7 @@ _FAILED: Final = frozenset({Phase.FAILED, Phase.REJECTED, Phase.EXPIRED})
 _OPEN: Final = frozenset({LinkState.ONLINE, LinkState.QUIET})
 
 
-@dataclass(slots=True)
-class UnshownStop:
+class UnshownStop(Struct):
     """One stop that was not shown (`not_shown`), or did not reach the car or was given up (`not_stopped`)."""
 
     car: str
@@ -59,8 +59,7 @@ class UnshownStop:
         }
 
 
-@dataclass(slots=True)
-class StopFindings:
+class StopFindings(Struct):
     """The stops of one session that were not shown, in the order of their times."""
 
     stops: list[UnshownStop] = field(default_factory=list)

@@ -3,10 +3,11 @@
 import shlex
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct, field, to_builtins
 
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.message_decoder import MessageDecoder
@@ -38,8 +39,7 @@ class SessionState(StrEnum):
     UNREADABLE = "unreadable"  # no file can be read, or the format is newer than ours
 
 
-@dataclass(slots=True)
-class SessionSummary:
+class SessionSummary(Struct):
     """One line of `fleet sessions list`."""
 
     name: str
@@ -74,7 +74,8 @@ class SessionSummary:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
-        return asdict(self)
+        found: dict[str, Any] = to_builtins(self)
+        return found
 
 
 def overviews(root: Path) -> Iterator[SessionSummary]:

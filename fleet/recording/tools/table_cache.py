@@ -23,11 +23,13 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import Final, Self
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
@@ -66,8 +68,7 @@ _MAX_TRIES: Final = 4
 """Maximum number of attempts to make tables. Another question may delete them if the session has grown meanwhile."""
 
 
-@dataclass(frozen=True, slots=True)
-class CachedTables:
+class CachedTables(Struct, frozen=True):
     """The tables of one session."""
 
     session: Path
@@ -269,8 +270,7 @@ def _layouts_text() -> str:
     return repr(sorted(_layouts().items()))
 
 
-@dataclass(frozen=True, slots=True)
-class _State:
+class _State(Struct, frozen=True):
     """Sizes and times of the files of a session."""
 
     names: tuple[str, ...]

@@ -4,11 +4,11 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from google.protobuf.message import DecodeError, Message
+from msgspec import Struct, field
 
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
@@ -26,8 +26,7 @@ STRAY_PREFIX: Final = "stray."
 """Prefix of tables with stray messages: the type of each does not fit its key."""
 
 
-@dataclass(frozen=True, slots=True)
-class Exported:
+class Exported(Struct, frozen=True):
     """Result of an export."""
 
     rows: Mapping[str, int]
@@ -40,8 +39,7 @@ class Exported:
     """Times that the format cannot hold, by name of the table. They are null there."""
 
 
-@dataclass(slots=True)
-class _Batch:
+class _Batch(Struct):
     """Buffered messages of a table, by column.
 
     One object per row would take a third more time for garbage collection.
@@ -83,8 +81,7 @@ class _Batch:
         ]
 
 
-@dataclass(slots=True)
-class _Table:
+class _Table(Struct):
     """One table, and its buffered messages."""
 
     sink: Sink

@@ -10,7 +10,6 @@ command.
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from operator import attrgetter
 from typing import Any, Final, Self
@@ -19,6 +18,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.json_format import Parse, ParseError
 from google.protobuf.message import DecodeError, Message
 from google.protobuf.message_factory import GetMessageClass
+from msgspec import Struct
 
 from schemas import keys, messages
 from schemas.topics import PROTOBUF, TOPICS
@@ -43,8 +43,7 @@ class ColumnKind(StrEnum):
     JSON = "json"  # a nested message as text
 
 
-@dataclass(frozen=True, slots=True)
-class Column:
+class Column(Struct, frozen=True):
     """One column of a table."""
 
     name: str

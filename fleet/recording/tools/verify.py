@@ -1,10 +1,10 @@
 """Verifies a session: its files, CRCs, sequence numbers, schemas and clocks. Repairs nothing."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from google.protobuf.message import Message
+from msgspec import Struct, field, to_builtins
 
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
@@ -22,8 +22,7 @@ MAX_LISTED_LINES: Final = 20
 """Maximum number of gaps to print. --json lists all."""
 
 
-@dataclass(slots=True)
-class Clock:
+class Clock(Struct):
     """Offset of the clock of a gateway or service from the recorder's, estimated from message times."""
 
     least_s: float
@@ -36,8 +35,7 @@ class Clock:
     """Largest backward step."""
 
 
-@dataclass(slots=True)
-class SessionVerdict:
+class SessionVerdict(Struct):
     """Result of the verification."""
 
     session: str
@@ -86,7 +84,7 @@ class SessionVerdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
-        return {"whole": self.whole, "missing_count": self.missing_count, **asdict(self)}
+        return {"whole": self.whole, "missing_count": self.missing_count, **to_builtins(self)}
 
     def words(self) -> Iterable[str]:
         """Yield the lines of the report. The first one is the verdict."""
@@ -217,7 +215,7 @@ class _Verifier:
     def end(self) -> None:
         for (key, publisher), stream in sorted(self._streams.items()):
             about = {"key": key, "publisher": publisher}
-            self._verdict.missing += [{**about, "count": gap.count, **asdict(gap)} for gap in stream.gaps]
+            self._verdict.missing += [{**about, "count": gap.count, **to_builtins(gap)} for gap in stream.gaps]
             if stream.unlisted:
                 at = stream.gaps[-1].before_ns
                 further = {"count": stream.unlisted, "first": stream.gaps[-1].last + 1, "last": stream.last}

@@ -3,9 +3,10 @@
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 MB: Final = 1_000_000
 FREE_WARNING_FACTOR: Final = 4
@@ -26,8 +27,7 @@ def free_bytes(path: Path) -> int:
     return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free
 
 
-@dataclass(frozen=True, slots=True)
-class Reserve:
+class Reserve(Struct, frozen=True):
     """The space that a recording leaves free. If less is free, the recording pauses."""
 
     bytes: int = 50 * MB

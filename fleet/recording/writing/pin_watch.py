@@ -9,10 +9,10 @@ it, or the only car if there are no others.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 from google.protobuf.message import DecodeError
+from msgspec.structs import replace
 
 from fleet.fleetfile.fleet_file import PinRule
 from fleet.policy.car_condition import CarCondition

@@ -13,8 +13,9 @@ together exceeds the quota, and the recorder warns.
 
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 PINNED_SHARE: Final = 0.5
 """Maximum share of the quota for pinned segments. The other half is for new recordings."""
@@ -39,8 +40,7 @@ class Spans:
         return index >= 0 and self._ends[index] >= begin_ns
 
 
-@dataclass(frozen=True, slots=True)
-class StoredSegment:
+class StoredSegment(Struct, frozen=True):
     """One segment on the disk. Times: of its first and last message, ns since the epoch."""
 
     session: str
@@ -53,8 +53,7 @@ class StoredSegment:
     pinned: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class StoredSession:
+class StoredSession(Struct, frozen=True):
     """A session from which the quota may remove files."""
 
     name: str
@@ -65,8 +64,7 @@ class StoredSession:
     """Size of its other files. They are removed with its last segment."""
 
 
-@dataclass(slots=True)
-class Taking:
+class Taking(Struct):
     """Segments, tables and whole sessions that the quota removes, in this order."""
 
     segments: list[StoredSegment] = field(default_factory=list)

@@ -9,9 +9,11 @@ import errno
 import shutil
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct, field
+from msgspec.structs import replace
 
 from fleet.quota import Quota
 from fleet.recording import session_dir
@@ -28,8 +30,7 @@ _UNCLOSED_IN_USE_S: Final = 60.0
 """An unclosed session that was written within this time may still belong to another recorder."""
 
 
-@dataclass(slots=True)
-class Enforced:
+class Enforced(Struct):
     """Result of one enforcement of the quota."""
 
     removed: list[Path] = field(default_factory=list)

@@ -12,11 +12,11 @@ import json
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import zenoh
+from msgspec import Struct
 
 from fleet.fleetfile.fleet_file import PinRule
 from fleet.policy.plan_requests import RequestRefused, check_sender
@@ -70,8 +70,7 @@ class _CommandRefused(Exception):
     """A command over the bus was rejected. The message is the answer."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordingOutcome:
+class RecordingOutcome(Struct, frozen=True):
     """Result of a recording. The counts by key contain only keys with losses."""
 
     session: Path

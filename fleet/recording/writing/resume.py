@@ -1,8 +1,9 @@
 """Finds an interrupted session that can be continued, because publishers still cache the lost messages."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from msgspec import Struct
 
 from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
@@ -13,8 +14,7 @@ RESUME_WINDOW_S: Final = 3 * CACHE_S
 """Time before the end of an interrupted session from which publishers may still cache messages."""
 
 
-@dataclass(frozen=True, slots=True)
-class ResumePoint:
+class ResumePoint(Struct, frozen=True):
     """End of an interrupted session, at which a new one continues, and the messages that are already recorded."""
 
     name: str

@@ -6,7 +6,6 @@ All methods are called from one thread. The module does not use the bus and star
 import contextlib
 import shutil
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
@@ -14,6 +13,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import zenoh
+from msgspec import Struct, field
 
 from fleet.quota import Quota
 from fleet.recording import session_dir
@@ -46,8 +46,7 @@ class Sync(StrEnum):
     SECOND = "second"
 
 
-@dataclass(frozen=True, slots=True)
-class Options:
+class Options(Struct, frozen=True):
     """Limits and files of the sessions to write. 0 means no limit."""
 
     segment_bytes: int = 512 * MB

@@ -5,8 +5,9 @@ once a second. If they pause, or if the next state has another boot_id, the gate
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.policy.decision import DecisionKind
 from fleet.policy.plan_requests import EVENTS, PlanRequest
@@ -20,8 +21,7 @@ MAX_STATE_PAUSE_NS: Final = 2_500_000_000
 """Maximum time between two states of a gateway that was there all the time. After a longer pause it counts as gone."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedDecision:
+class RecordedDecision(Struct, frozen=True):
     """One decision about a subject.
 
     It holds from `at_ns` (the recorder's clock) until the next decision about that subject.
@@ -63,8 +63,7 @@ def add(timeline: Timeline, subject: str, decision: RecordedDecision) -> None:
         before.append(decision)
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedRequest:
+class RecordedRequest(Struct, frozen=True):
     """A request of a person that the coordinator carried out."""
 
     at_ns: int
@@ -75,8 +74,7 @@ class RecordedRequest:
 _REQUESTS: Final = {f"{keys.COORDINATOR} {code}": (request, words) for request, (code, words) in EVENTS.items()}
 
 
-@dataclass(slots=True)
-class CoordinatorRun:
+class CoordinatorRun(Struct):
     """One coordinator, from its first message in the session to its last."""
 
     fleet: str
@@ -142,8 +140,7 @@ def runs(recorded: Iterable[Recorded]) -> list[CoordinatorRun]:
     return sorted(found.values(), key=lambda run: run.start_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class PresenceToken:
+class PresenceToken(Struct, frozen=True):
     """A car appeared on the bus or disappeared."""
 
     at_ns: int
@@ -192,8 +189,7 @@ def decode_message(item: Recorded) -> Any:
         return None
 
 
-@dataclass(frozen=True, slots=True)
-class DecisionDifference:
+class DecisionDifference(Struct, frozen=True):
     """Time span in which the recorded decision differs from the new one. None means no decision."""
 
     subject: str

@@ -7,8 +7,9 @@ Memory is bounded.
 import heapq
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.recording.reading.session import Recorded
 from schemas import keys, messages
@@ -25,8 +26,7 @@ Readings = Mapping[str, Mapping[str, Any]]
 """Fields by topic, without values that were not measured."""
 
 
-@dataclass(slots=True)
-class Rx:
+class Rx(Struct):
     """Bytes from a car, with the verdict and the readings that were recorded for them."""
 
     at_ns: int
@@ -37,24 +37,21 @@ class Rx:
     """Recorded readings of the topics in `published`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Tx:
+class Tx(Struct, frozen=True):
     """Bytes to a car."""
 
     at_ns: int
     data: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class KnownMode:
+class KnownMode(Struct, frozen=True):
     """The mode of the car from this time on, or None if it is unknown."""
 
     at_ns: int
     mode: Mode | None
 
 
-@dataclass(frozen=True, slots=True)
-class KnownPlatform:
+class KnownPlatform(Struct, frozen=True):
     """Platform of the car from this time on."""
 
     at_ns: int
@@ -64,8 +61,7 @@ class KnownPlatform:
 Item = Rx | Tx | KnownMode | KnownPlatform
 
 
-@dataclass(slots=True)
-class SkippedMessages:
+class SkippedMessages(Struct):
     """Counts of messages that could not be used."""
 
     broken: dict[str, int] = field(default_factory=dict)

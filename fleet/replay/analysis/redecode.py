@@ -8,9 +8,10 @@ undecided, and it is a difference only if none of the results is the recorded on
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from gateway import drivers
@@ -35,8 +36,7 @@ Outcome = tuple[str, dict[str, dict[str, Any]]]
 """Verdict, and fields of each reading by topic."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReadingDifference:
+class ReadingDifference(Struct, frozen=True):
     """One difference between the recorded and the new result."""
 
     car: str
@@ -48,8 +48,7 @@ class ReadingDifference:
     now: Any
 
 
-@dataclass(slots=True)
-class Counts:
+class Counts(Struct):
     """Counts of the comparison of one car."""
 
     frames: int = 0
@@ -65,8 +64,7 @@ class NoPlatform(Exception):
     """The recording does not contain the platform of a car. The message says what to do."""
 
 
-@dataclass(slots=True)
-class Redecoding:
+class Redecoding(Struct):
     """Compares the items of one car in their order. A `platform` that is not None replaces the recorded platform."""
 
     car: str

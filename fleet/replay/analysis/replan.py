@@ -8,8 +8,11 @@ step after every message, and ten times a second), and the order of messages tha
 import contextlib
 import heapq
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from fleet.coordinator.observer import FleetObserver
 from fleet.policy.decide import step
@@ -44,8 +47,7 @@ _FINAL_PHASES: Final = frozenset(Phase) - {Phase.ASKED, Phase.QUEUED}
 _SUCCESS_PHASES: Final = frozenset({Phase.SENT, Phase.COMPLETE, Phase.EFFECT_SEEN})
 
 
-@dataclass(frozen=True, slots=True)
-class _NewPlan:
+class _NewPlan(Struct, frozen=True):
     at_ns: int
     plan: Plan
 

@@ -3,11 +3,10 @@
 All times count from one origin, in whole nanoseconds of the recording. So a message that is late does not delay others.
 """
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 
-@dataclass(slots=True)
-class Schedule:
+class Schedule(Struct):
     """Converts times of the recorder, in order, to seconds since the origin."""
 
     rate: float = 1.0

@@ -9,9 +9,10 @@ another, and so on.
 from collections import Counter
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from fleet.recording.left_out import LeftOut, LeftOutCause, has_unknown_enum, may_have_enum
 from fleet.recording.reading.mcap_copy import McapCopy
@@ -26,8 +27,7 @@ MAX_VARIANTS: Final = 16
 """Maximum number of copies. If a key has more schemas than this, the remaining ones share the last copy."""
 
 
-@dataclass(slots=True)
-class Prepared:
+class Prepared(Struct):
     """The files to give to Rerun, and the number of messages that were recorded."""
 
     files: list[Path]

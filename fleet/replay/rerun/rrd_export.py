@@ -10,13 +10,13 @@ import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Final
 
 import rerun as rr
 import rerun.chunk as rrc
+from msgspec import Struct
 
 from fleet.fleetfile.fleet_file import read_colors
 from fleet.recording.left_out import LeftOut, LeftOutCause
@@ -45,8 +45,7 @@ class ExportFailed(Exception):
     """The .rrd could not be written. The message gives the reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
+class Part(Struct, frozen=True):
     """The part of a session to show: cars and a time span. The fleet's services are always included."""
 
     cars: tuple[str, ...] = ()
@@ -96,8 +95,7 @@ class _SchemaRefused(Exception):
         self.name = name
 
 
-@dataclass(frozen=True, slots=True)
-class Replayed:
+class Replayed(Struct, frozen=True):
     """The numbers of recorded messages that are shown and left out. Each message is one or the other."""
 
     shown: Counter[str]

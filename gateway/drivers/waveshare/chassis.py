@@ -1,8 +1,9 @@
 """The platforms of the family, by their firmware. docs/reference/waveshare.md has the source of each number."""
 
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.drivers.plain_profile import PlainProfile
 from schemas.words import Light
@@ -15,8 +16,7 @@ class UgvFirmware(StrEnum):
     ROS = "ugv_base_ros"
 
 
-@dataclass(frozen=True, slots=True)
-class Chassis:
+class Chassis(Struct, frozen=True):
     """One chassis with one firmware."""
 
     main: int

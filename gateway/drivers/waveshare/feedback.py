@@ -6,8 +6,9 @@ and the beginning of a line that the link has truncated. Each of these becomes a
 
 import json
 import math
-from dataclasses import dataclass
 from typing import Any, Final
+
+from msgspec import Struct
 
 from gateway.control.driver import Event, Rejected, TextLine
 from gateway.drivers.waveshare.chassis import UgvFirmware
@@ -25,8 +26,7 @@ acceleration."""
 _DECODER: Final = json.JSONDecoder()
 
 
-@dataclass(frozen=True, slots=True)
-class Feedback:
+class Feedback(Struct, frozen=True):
     """One report. A field is None if the report does not have it. `at` is the time of the last byte."""
 
     raw: bytes

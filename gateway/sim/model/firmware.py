@@ -7,9 +7,10 @@ the sensors.
 
 from collections import deque
 from collections.abc import Generator
-from dataclasses import dataclass
 from math import ceil, inf
 from typing import Final, NamedTuple, Protocol, TypeAlias
+
+from msgspec import Struct
 
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.scheduler import EventScheduler
@@ -84,8 +85,7 @@ class CarBodyState(Protocol):
         """Return the yaw rate, left positive."""
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
+class Truth(Struct, frozen=True):
     """The true state of a simulated car."""
 
     mode: Mode
@@ -109,8 +109,7 @@ class Truth:
         return self.motor_left != 0 or self.motor_right != 0
 
 
-@dataclass(frozen=True, slots=True)
-class Wait:
+class Wait(Struct, frozen=True):
     """A block of the program until `until`, or until the next byte if a byte `wakes` it."""
 
     until: float

@@ -4,10 +4,12 @@ Times are seconds since the start of the world.
 """
 
 from bisect import bisect_right
-from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from math import cos, hypot, sin, sqrt
 from typing import Final
+
+from msgspec import Struct
+from msgspec.structs import replace
 
 from gateway.sim.model.firmware import Pose
 from schemas.geometry import (
@@ -29,8 +31,7 @@ FASTEST_M_S: Final = 0.5
 """Maximum speed of a thing."""
 
 
-@dataclass(frozen=True, slots=True)
-class Lamp:
+class Lamp(Struct, frozen=True):
     """A light that a sensor sees from up to `reach_m` away."""
 
     x_m: float
@@ -51,8 +52,7 @@ class Lamp:
         return self.reach_m * sqrt(self.brightness) if self.on else 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class MovingObject:
+class MovingObject(Struct, frozen=True):
     """A disc, or a box if it has no radius. It stands, moves along a path, or is carried by a car."""
 
     name: str

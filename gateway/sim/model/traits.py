@@ -4,8 +4,9 @@ Public programs of one family differ in the rhythm of their reports, in what blo
 is a parameter of a simulated car, so that each of these cars can be tried.
 """
 
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from schemas.words import Mode
 
@@ -14,8 +15,7 @@ ECHO_RANGING_S: Final = 0.011
 """Time of one ranging with an echo, which is part of the interval between two reports."""
 
 
-@dataclass(frozen=True, slots=True)
-class CarTraits:
+class CarTraits(Struct, frozen=True):
     """The parameters of one car. The defaults are those of the simulated Arduino car."""
 
     interval_s: float = 1.254

@@ -13,9 +13,10 @@ import json
 import re
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from math import degrees, inf
 from typing import Any, Final
+
+from msgspec import Struct
 
 from gateway.sim.model.car_body import TOP_SPEED_M_S, CarBody
 from gateway.sim.model.firmware import Pose, Rng, Truth
@@ -68,8 +69,7 @@ UART_S: Final = 0.3
 """Time from a reset until the program has opened its UART. Bytes that arrive before that are lost."""
 
 
-@dataclass(frozen=True, slots=True)
-class UgvBuild:
+class UgvBuild(Struct, frozen=True):
     """One product: its firmware, and its real chassis. `main` is the number of the chassis in `T:900`."""
 
     is_ros: bool

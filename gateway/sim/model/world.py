@@ -6,9 +6,10 @@ x forward, y left, angles counter-clockwise.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from math import atan2, ceil, cos, floor, hypot, sin
 from typing import Final, Protocol
+
+from msgspec.structs import replace
 
 from gateway.sim.model.firmware import Pose
 from gateway.sim.model.objects import Lamp, MovingObject, carried
@@ -363,7 +364,7 @@ class World:
         """Change fields of a lamp."""
         self.lamps = tuple(
             # `world_commands` has checked the names and types.
-            replace(lamp, **fields) if lamp.name == name else lamp  # type: ignore[arg-type]
+            replace(lamp, **fields) if lamp.name == name else lamp
             for lamp in self.lamps
         )
 

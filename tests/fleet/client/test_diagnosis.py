@@ -1,9 +1,9 @@
 """Each row of the doctor's table, and its result for a car without faults."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from fleet.client.car_state import CarState
 from fleet.client.diagnosis import CHECKS, CarEvidence, as_dict, describe, describe_reports, diagnose

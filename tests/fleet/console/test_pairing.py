@@ -1,11 +1,11 @@
 """Pairing codes, cookies and the slow-down, on virtual time."""
 
 from contextlib import suppress
-from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from fleet.console import pairing
 from fleet.console.connection_limit import (

@@ -1,7 +1,8 @@
 """Snapshots of cars for the tests of policy/. Times are seconds of one clock."""
 
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from fleet.policy.decide import DecisionStep, step
 from fleet.policy.plan.plan import Plan

@@ -1,12 +1,12 @@
 """Decisions by snapshots, step by step on virtual time: cars take roles, and no role flaps."""
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from fleet.examples import EXAMPLES
 from fleet.policy.decide import step

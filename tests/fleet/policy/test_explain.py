@@ -1,9 +1,9 @@
 """The text of each kind of decision is that of tests/vectors/decisions.tsv, on the case that the row names."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from fleet.policy.decision import DecisionKind
 from fleet.policy.plan.plan_parser import parse

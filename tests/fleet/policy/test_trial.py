@@ -1,8 +1,7 @@
 """A dry run decides first what a coordinator would, and the changes of a plan are told part by part."""
 
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 
 from fleet.policy.difference import plan_changes
 from fleet.policy.plan.plan_parser import parse

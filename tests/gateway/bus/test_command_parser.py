@@ -3,12 +3,12 @@
 import json
 import math
 import time
-from dataclasses import fields
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import fields
 
 from gateway.bus import command_parser
 from gateway.bus.car_service import Request

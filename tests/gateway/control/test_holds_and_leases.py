@@ -1,9 +1,8 @@
 """Tests of hold, e-stops, pauses, loan and lease as values. Gateways agree, in whatever order they merge e-stops."""
 
-from dataclasses import replace
-
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from gateway.control.holds_and_leases import (
     MAX_ENDED_ESTOPS,

@@ -3,9 +3,9 @@
 import functools
 import itertools
 from collections.abc import Iterator
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.control.commands import (
     Action,

@@ -3,12 +3,12 @@
 import json
 import re
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.control.driver import Desk, Event
 from gateway.drivers import Family, check

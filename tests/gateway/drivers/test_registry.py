@@ -1,9 +1,9 @@
 """A platform finds its family: ours by a table, others by the entry point of their package."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from gateway import drivers
 from schemas.words import Mode

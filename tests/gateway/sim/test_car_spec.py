@@ -1,8 +1,7 @@
 """Descriptions of cars on the command line, and one-line errors for invalid ones."""
 
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 
 from gateway.sim.car_spec import BadSpec, CarSpec, PtyPath, ReplaySpec, TcpListen, parse_car, parse_cars, parse_replay
 from gateway.sim.model.stm32 import STM32_TRAITS

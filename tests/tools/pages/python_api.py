@@ -136,7 +136,7 @@ def _type(annotation: object) -> str:
 def _attributes(of: type) -> list[str]:
     """Return the fields of a class with their docstrings."""
     source = inspect.getsource(of)
-    if not hasattr(of, "__dataclass_fields__"):
+    if not (hasattr(of, "__dataclass_fields__") or hasattr(of, "__struct_fields__")):
         return []
     found = re.findall(r'^    (\w+): ([^=\n]+?)(?: = [^\n]+)?\n(?:    """((?:.|\n)*?)""")?', source, flags=re.MULTILINE)
     return [

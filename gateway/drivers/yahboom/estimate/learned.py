@@ -19,9 +19,10 @@ is sent only to learn. `Learned.kept` and `Learned.restore` preserve all of this
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, Final
+
+from msgspec import Struct, field
 
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
@@ -68,8 +69,7 @@ def blocking_kind(frame: Frame) -> Blocking | None:
             return None
 
 
-@dataclass(slots=True)
-class Rhythm:
+class Rhythm(Struct):
     """The interval of undisturbed reports, s."""
 
     intervals: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_INTERVALS))
@@ -142,8 +142,7 @@ class Rhythm:
         return abs(delay_s - count * self.median_s) <= tolerance_s
 
 
-@dataclass(slots=True)
-class Learned:
+class Learned(Struct):
     """The habits of one car. Times: s."""
 
     echo: Rhythm = field(default_factory=Rhythm)

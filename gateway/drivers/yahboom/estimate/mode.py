@@ -5,8 +5,9 @@ modes can be distinguished, and how soon. The tests check that table.
 """
 
 from collections import deque
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.protocol.modes import SILENT_MODES, candidate_modes
@@ -35,8 +36,7 @@ MAX_BLOCKS: Final = 256
 """Maximum number of blocking frames that are remembered to excuse a silence, as during endless whistling."""
 
 
-@dataclass(slots=True)
-class ModeEstimator:
+class ModeEstimator(Struct):
     """The commanded mode (`asked`), the inferred mode, and the verdict. Times: s, monotonic."""
 
     profile: Profile

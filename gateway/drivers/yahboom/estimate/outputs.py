@@ -3,7 +3,9 @@
 The car confirms none of them. Its readings are evidence only of its mode (see mode.py).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.drivers.yahboom.protocol.platforms import Profile

@@ -8,6 +8,8 @@ corrupted, so three in a row count.
 from dataclasses import dataclass, field
 from typing import Final
 
+from msgspec import Struct
+
 from gateway.control.driver import Rejected, TextLine
 from gateway.drivers.yahboom.protocol.modes import candidate_modes, only_candidate
 from gateway.drivers.yahboom.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
@@ -33,8 +35,7 @@ TWO_CELLS_V: Final = 9.0
 """Voltage above which a battery must have more than two cells: two full cells have 8.4 V."""
 
 
-@dataclass(slots=True)
-class _PlatformEvidence:
+class _PlatformEvidence(Struct):
     """Debounces one observation over several frames."""
 
     holds: bool = False

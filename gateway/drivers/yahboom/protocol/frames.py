@@ -4,9 +4,10 @@
 """
 
 import re
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, TypeVar
+
+from msgspec import Struct
 
 from gateway.drivers.yahboom.protocol.modes import MODES
 from schemas.words import Light, Mode, Motion, ServoAction, SpeedStep
@@ -21,8 +22,7 @@ class EncodeError(ValueError):
     """A value that the table does not allow. The message names the field, the value and the range."""
 
 
-@dataclass(frozen=True, slots=True)
-class Dialect:
+class Dialect(Struct, frozen=True):
     """The spelling of the frames of one program.
 
     `head` is the first word of named frames and readings. With `swaps_green_and_blue`, place 7 has 3 for blue and 4 for
@@ -36,8 +36,7 @@ class Dialect:
 STANDARD: Final = Dialect()
 
 
-@dataclass(frozen=True, slots=True)
-class General:
+class General(Struct, frozen=True):
     """The nine-field frame. It always carries a motion.
 
     All other fields are one-shot: if they are sent again, they act again (the fan toggles, the speed increases). If a
@@ -53,8 +52,7 @@ class General:
     fan: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Ptz:
+class Ptz(Struct, frozen=True):
     """The angle of the front servo, 0..180 degrees, as on the wire.
 
     The vendor's programs drive the servo to 180 - deg, some forks to deg (`Profile.ptz_direct`).
@@ -63,8 +61,7 @@ class Ptz:
     deg: int
 
 
-@dataclass(frozen=True, slots=True)
-class ColorLed:
+class ColorLed(Struct, frozen=True):
     """The color LED, 0..255 each."""
 
     r: int
@@ -72,29 +69,25 @@ class ColorLed:
     b: int
 
 
-@dataclass(frozen=True, slots=True)
-class ModeOpen:
+class ModeOpen(Struct, frozen=True):
     """Enter a mode. `Mode.MANUAL` (`MODE01`) is not allowed."""
 
     mode: Mode
 
 
-@dataclass(frozen=True, slots=True)
-class ModeClose:
+class ModeClose(Struct, frozen=True):
     """Stop the motors and return to mode 0. `Mode.MANUAL` (`MODE00`) closes any mode."""
 
     mode: Mode = Mode.MANUAL
 
 
-@dataclass(frozen=True, slots=True)
-class ArmSet:
+class ArmSet(Struct, frozen=True):
     """The six joints of an arm, 0..180 degrees each."""
 
     joint_deg: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Reset:
+class Reset(Struct, frozen=True):
     """A lone `#`. It ends a truncated frame in the car's buffer. If the buffer is empty, it stops a car in mode 0."""
 
 

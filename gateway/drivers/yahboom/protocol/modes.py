@@ -2,9 +2,10 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, Sensors, sensors_pattern
 from schemas.words import Mode
@@ -12,8 +13,7 @@ from schemas.words import Mode
 EVERY_MEASUREMENT: Final = frozenset(field.measurement for field in SENSOR_FIELDS)
 
 
-@dataclass(frozen=True, slots=True)
-class ModeRow:
+class ModeRow(Struct, frozen=True):
     """The facts of docs/reference/protocol.md#modes about one mode.
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the

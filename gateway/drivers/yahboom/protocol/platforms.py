@@ -4,10 +4,11 @@ Every number cites its row of docs/reference/protocol.md. The times are in `timi
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.drivers.yahboom.protocol.frames import (
     STANDARD_HEAD,
@@ -58,8 +59,7 @@ _HORIZONTAL: Final = frozenset(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class SpeedModel:
+class SpeedModel(Struct, frozen=True):
     """The gateway's estimate of the speed, by counting steps, in the car's own unit."""
 
     start: float
@@ -123,8 +123,7 @@ def _common_measurements(modes: tuple[Mode, ...], shown: tuple[Mode, ...]) -> fr
     return common
 
 
-@dataclass(frozen=True, slots=True)
-class Profile:
+class Profile(Struct, frozen=True):
     """One kind of car: a column of the table in docs/reference/protocol.md#platforms."""
 
     kind: Platform

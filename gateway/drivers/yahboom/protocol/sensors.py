@@ -6,9 +6,10 @@ of `SENSOR_FIELDS`, an attribute of `Sensors`, and a variable in `read_sensors`.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, NamedTuple
+
+from msgspec import Struct
 
 from schemas.words import Cause
 
@@ -20,8 +21,7 @@ _BITS_2: Final = {b"%d%d" % (a, b): (bool(a), bool(b)) for a in (0, 1) for b in 
 _BITS_4: Final = {left + right: (*_BITS_2[left], *_BITS_2[right]) for left in _BITS_2 for right in _BITS_2}
 
 
-@dataclass(frozen=True, slots=True)
-class SensorField:
+class SensorField(Struct, frozen=True):
     """One field of the sensors frame.
 
     `measurement` is its name in modes, profiles, conditions and in its topic `sensor/<measurement>`. `attribute` is its
@@ -77,8 +77,7 @@ SENSOR_FIELDS: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class FrameWords:
+class FrameWords(Struct, frozen=True):
     """The words of one kind of frame, in wire order."""
 
     words: tuple[bytes, ...]
@@ -96,8 +95,7 @@ SENSOR_WORDS: Final = FrameWords(tuple(field.word for field in SENSOR_FIELDS))
 ATTRIBUTES: Final = {field.measurement: field.attribute for field in SENSOR_FIELDS}
 
 
-@dataclass(frozen=True, slots=True)
-class RejectedField:
+class RejectedField(Struct, frozen=True):
     """One field of a good frame whose value is out of its range. `word` is its name in the frame."""
 
     word: str

@@ -4,14 +4,13 @@
 has, are in `gateway.control.driver`. Everything that depends on the platform is in `platforms`.
 """
 
-from dataclasses import dataclass
+from msgspec import Struct
 
 from gateway.control.driver import Echo, Rejected, TextLine
 from gateway.drivers.yahboom.protocol.sensors import RejectedField, Sensors
 
 
-@dataclass(frozen=True, slots=True)
-class ArmReading:
+class ArmReading(Struct, frozen=True):
     """Six joints, 0..180 degrees. None where the joint was rejected. `at` is the time of the last byte."""
 
     raw: bytes
@@ -20,8 +19,7 @@ class ArmReading:
     rejects: tuple[RejectedField, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class ImuReading:
+class ImuReading(Struct, frozen=True):
     """Gyro and acceleration x, y, z in raw counts (the table gives no unit). `at` is the time of the last byte."""
 
     raw: bytes

@@ -8,8 +8,9 @@ docs/reference/stop-evidence.md has `CASES` as a table.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from schemas.words import Platform
@@ -18,8 +19,7 @@ DOUBTED_PROBES: Final = 2
 """Maximum probes of a car whose readings contradict its platform. It may be a Raspberry Pi, which never reacts."""
 
 
-@dataclass(frozen=True, slots=True)
-class StopFacts:
+class StopFacts(Struct, frozen=True):
     """The facts about the stop in progress on which the rules of the cases depend."""
 
     frames_sent: bool
@@ -50,8 +50,7 @@ def _no(_: StopFacts) -> bool:
     return False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StopCase:
+class StopCase(Struct, frozen=True, eq=False):
     """One case of a stop, by what was stopped and what the car can report."""
 
     name: str

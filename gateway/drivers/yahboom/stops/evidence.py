@@ -50,9 +50,10 @@ but no such frame is known. A car that by itself reports late twice at just the 
 half-duplex link whose mute time changes from write to write can pass the control by chance.
 """
 
-from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
+
+from msgspec import Struct, field
 
 from gateway.drivers.yahboom.estimate.learned import SAME_S, Learned, Rhythm
 from gateway.drivers.yahboom.protocol.modes import candidate_modes
@@ -127,8 +128,7 @@ class Finding(StrEnum):
 _NEVER: Final = float("-inf")
 
 
-@dataclass(frozen=True, slots=True)
-class _Block:
+class _Block(Struct, frozen=True):
     """A frame that blocks the car: its kind, its maximum block, and when it was written.
 
     `kind` is None for a `MODE00` that will not be judged. Its block is not learned.
@@ -139,8 +139,7 @@ class _Block:
     at: float
 
 
-@dataclass(slots=True)
-class StopEvidence:
+class StopEvidence(Struct):
     """Compares readings with written frames. Times: s, monotonic, when bytes arrived or frames were written."""
 
     profile: Profile

@@ -1,7 +1,8 @@
 """The stop sequences as tables of frames and times, by docs/reference/protocol.md#stops. No state."""
 
-from dataclasses import dataclass
 from typing import Final
+
+from msgspec import Struct
 
 from gateway.drivers.yahboom.pacing import NAMED_GAP_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Reset
@@ -16,8 +17,7 @@ JUDGED_S: Final = 2.3
 """Time from `MODE00` to the general stop if the car was in another mode than 0."""
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
+class Step(Struct, frozen=True):
     """One frame of a sequence. `after_s` is the minimum time after the frame before it, or after the try began."""
 
     frame: Frame
@@ -25,8 +25,7 @@ class Step:
     after_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class StopSequence:
+class StopSequence(Struct, frozen=True):
     """A way to stop. Only a sequence of a higher `rank` replaces the running one."""
 
     name: str

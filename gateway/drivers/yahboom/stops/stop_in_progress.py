@@ -3,8 +3,9 @@
 `sequences` has the frames.
 """
 
-from dataclasses import dataclass, field
 from typing import Final
+
+from msgspec import Struct, field
 
 from gateway.control.command_log import Pending
 from gateway.drivers.yahboom.estimate.learned import Learned
@@ -74,8 +75,7 @@ def report_wait_s(profile: Profile, learned: Learned, *, slowest: bool = False) 
     return 2 * profile.ranging_s + learned.close_s(profile.close_s) + interval_s + REPORT_MARGIN_S
 
 
-@dataclass(frozen=True, slots=True)
-class StopContext:
+class StopContext(Struct, frozen=True):
     """The state of the car that decides which stop it needs."""
 
     profile: Profile
@@ -115,8 +115,7 @@ class StopContext:
         return self.profile.mode_turn_s(self.mode if known and self.mode is not None else Mode.OBSTACLE_AVOIDANCE)
 
 
-@dataclass(slots=True)
-class StopInProgress:
+class StopInProgress(Struct):
     """A stop in progress: the frames of its current try, and the commands that end with it. Times: s, monotonic.
 
     A stop ends on evidence (see evidence.py). After its last frame it waits for a report, then tries again.

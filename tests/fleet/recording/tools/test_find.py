@@ -10,7 +10,6 @@ import subprocess
 from collections import Counter
 from collections.abc import Iterable
 from copy import deepcopy
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import pytest
 import rerun.chunk as rrc
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorSet
 from mcap.writer import Writer
+from msgspec.structs import replace
 
 from fleet.client.condition import KeyCondition
 from fleet.client.reading import Reading

@@ -1,13 +1,13 @@
 """Recorded frames against today's decoder: recorded vectors have no difference, and each change is found."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
 from mcap.writer import Writer
+from msgspec.structs import replace
 
 from fleet.cli import cli
 from fleet.replay.analysis import vector_file

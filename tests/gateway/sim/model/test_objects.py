@@ -3,12 +3,12 @@
 import copy
 import itertools
 import random
-from dataclasses import replace
 from math import hypot, isfinite, pi
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from gateway.sim.model.car_body import SONAR_REACH_CM, CarBody
 from gateway.sim.model.factory import build

@@ -1,10 +1,10 @@
 """Any bytes give the same events, wherever they are cut. Readings of every spelling decode to their values."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from gateway.drivers.yahboom.protocol.decoder import Decoder
 from gateway.drivers.yahboom.protocol.sensors import Sensors

@@ -5,10 +5,10 @@ tests/support/stops.py has the cases. tests/soak plays 200 moments of each, and 
 
 import random
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import product
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.control.commands import Action, AimServo, Drive, Led, SetMode, Signal, Stop
 from gateway.drivers.yahboom.estimate.learned import Learned
