@@ -45,6 +45,7 @@ NOT_RUN: Final = {
     r"fleet exporter( --address .*)?": "stays until Ctrl-C; tests/e2e/test_exporter.py runs it",
     r"fleet foxglove( --address .*)?": "stays until Ctrl-C; tests/e2e/test_foxglove.py runs it",
     r"(FLEET_MQTT_PASSWORD=\w+ )?fleet mqtt.*": "needs a broker; tests/soak/test_mqtt.py has one",
+    r"zbarcam .*": "needs a camera",
     r"fleet (hub|join|leave).*|.*--secure": "makes a hub of this computer; tests/e2e/test_secure_up.py runs it",
     r"eval .*": "is for a shell; tests/fleet/commands/test_shells.py runs it",
     r"fleet demo.*": "tests/fleet/test_demo.py runs it",
@@ -179,14 +180,19 @@ class Prompt:
         printed = []
         for part in re.split(r"&&|;", command):
             typed, _, file = part.strip().partition(" > ")
-            program, *arguments = shlex.split(typed)
+            words = shlex.split(typed)
+            environment = dict(self.environment)
+            while "=" in words[0]:
+                name, _, value = words.pop(0).partition("=")
+                environment[name] = value
+            program, *arguments = words
             with contextlib.chdir(self.place):
                 if program == "gateway":
                     done = gateway_command(*arguments)
                 else:
-                    done = fleet_command(*arguments, environment=self.environment)
+                    done = fleet_command(*arguments, environment=environment)
                     while "Try again" in done.stderr or "[stale]" in done.stderr:  # a person does
-                        done = fleet_command(*arguments, environment=self.environment)
+                        done = fleet_command(*arguments, environment=environment)
             expected = OTHER_RESULTS.get(command)
             other = expected is not None and done.returncode in (1, 2) and expected in done.stdout + done.stderr
             assert done.returncode == 0 or other, (LINES.get(command), command, done.stdout, done.stderr)
