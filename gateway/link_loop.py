@@ -7,7 +7,6 @@ ever.
 import asyncio
 import random
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 from typing import Final
 
 from gateway.bus.car_publisher import RAW_PER_S, CarPublisher, shown_state
@@ -210,4 +209,4 @@ class LinkLoop:
 
 def at_rate(url: LinkUrl, baud: int) -> LinkUrl:
     """Return a link with the baud rate of its car, unless its URL names another rate."""
-    return replace(url, baud=baud) if isinstance(url, SerialUrl | UsbUrl) and url.baud == BAUD else url
+    return url.at_rate(baud) if isinstance(url, SerialUrl | UsbUrl) and url.baud == BAUD else url

@@ -8,12 +8,10 @@ import ipaddress
 import os.path
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 from importlib.util import find_spec
 from itertools import combinations
-from types import MappingProxyType
-from typing import Any, ClassVar, Final, Protocol
+from typing import ClassVar, Final, Protocol
 from urllib.parse import SplitResult, parse_qs, quote, unquote, urlsplit
 
 from schemas.suggestion import how_to_install, nearest
@@ -54,10 +52,14 @@ class Look(Protocol):
         """Look for a host. Do not connect to a port where that could harm a car."""
 
 
-@dataclass(frozen=True, slots=True)
+# Plain classes: dataclasses, and what they import, took a fifth of the time until a gateway is on the bus.
 class LinkUrl(ABC):
-    """A link: how it is written, and what is known about it before it is opened. `str` returns its URL."""
+    """A link: how it is written, and what is known about it before it is opened. `str` returns its URL.
 
+    Links with equal URLs are equal. A link never changes.
+    """
+
+    __slots__ = ()
     scheme: ClassVar[str]
     forms: ClassVar[tuple[str, ...]]
     """How a URL of this kind is written, for the help."""
@@ -71,8 +73,6 @@ class LinkUrl(ABC):
     """The name of what the module brings, for people."""
     harm: ClassVar[str] = ""
     """The harm that opening and closing it may do to a car, in words. Empty if none."""
-    same_car: ClassVar[Mapping[str, Any]] = {}
-    """Options that say nothing about which car it is, with their default values."""
 
     @classmethod
     @abstractmethod
@@ -100,6 +100,10 @@ class LinkUrl(ABC):
         """Yield the keys of all links that may name the port of this one."""
         yield self.port_key
 
+    def without_options(self) -> "LinkUrl":
+        """Return the link without the options that say nothing about which car it is: baud rate and adapter."""
+        return self
+
     def check(self, look: Look) -> tuple[bool, str]:  # noqa: ARG002 - Bluetooth cannot be looked at
         """Return True if a car may be there, and a text. Do not open what could move or reset a car."""
         if missing := self.missing():
@@ -110,14 +114,31 @@ class LinkUrl(ABC):
         """Return a sentence that asks about the baud rate, for a link whose bytes contain no frame."""
         return f"Is the module at the baud rate of the car, {BAUD}?"
 
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and str(other) == str(self)
+
+    def __hash__(self) -> int:
+        return hash(str(self))
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self)!r})"
+
 
 class _SerialLine(LinkUrl):
     """A serial port, named in one of two ways."""
 
-    __slots__ = ()
-    baud: int
+    __slots__ = ("baud",)
     scheme = "serial"
-    same_car = MappingProxyType({"baud": BAUD})
+
+    def __init__(self, baud: int) -> None:
+        self.baud: Final = baud
+
+    @abstractmethod
+    def at_rate(self, baud: int) -> "LinkUrl":
+        """Return the link with another baud rate."""
+
+    def without_options(self) -> "LinkUrl":
+        return self.at_rate(BAUD)
 
     @classmethod
     def parse(cls, text: str) -> "LinkUrl | None":
@@ -132,13 +153,19 @@ class _SerialLine(LinkUrl):
         return f"The port is at {self.baud} baud: does this car use another one (?baud=115200)?"
 
 
-@dataclass(frozen=True, slots=True)
 class SerialUrl(_SerialLine):
     """A serial port by its device path."""
 
-    path: str
-    baud: int = BAUD
+    __slots__ = ("path",)
     forms = ("/dev/ttyUSB0",)
+
+    def __init__(self, path: str, baud: int = BAUD) -> None:
+        super().__init__(baud)
+        self.path: Final = path
+
+    def at_rate(self, baud: int) -> "SerialUrl":
+        """Return the link with another baud rate."""
+        return SerialUrl(self.path, baud)
 
     @classmethod
     def guess(cls, text: str) -> str:
@@ -160,18 +187,26 @@ class SerialUrl(_SerialLine):
         return f"serial://{self.path}" + ("" if self.baud == BAUD else f"?baud={self.baud}")
 
 
-@dataclass(frozen=True, slots=True)
 class UsbUrl(_SerialLine):
     """A serial port by the ids of its USB device, wherever it is plugged in. At least one id is set.
 
     vid, pid: 0 to 0xFFFF. `serial` is the whole serial number of the device.
     """
 
-    vid: int | None = None
-    pid: int | None = None
-    serial: str | None = None
-    baud: int = BAUD
+    __slots__ = ("pid", "serial", "vid")
     forms = ("serial://?vid=1a86&serial=ABC",)
+
+    def __init__(
+        self, vid: int | None = None, pid: int | None = None, serial: str | None = None, baud: int = BAUD
+    ) -> None:
+        super().__init__(baud)
+        self.vid: Final = vid
+        self.pid: Final = pid
+        self.serial: Final = serial
+
+    def at_rate(self, baud: int) -> "UsbUrl":
+        """Return the link with another baud rate."""
+        return UsbUrl(self.vid, self.pid, self.serial, baud)
 
     def fits(self, vid: int | None, pid: int | None, serial: str | None) -> bool:
         """Return True if this link may mean a device with these ids."""
@@ -201,18 +236,20 @@ class UsbUrl(_SerialLine):
         return "serial://?" + "&".join(ids + number + baud)
 
 
-@dataclass(frozen=True, slots=True)
 class TcpUrl(LinkUrl):
     """A car or a bridge that listens on TCP."""
 
-    host: str
-    port: int
+    __slots__ = ("host", "port")
     scheme = "tcp"
     forms = ("tcp://host:8888",)
     harm = (
         "a Raspberry Pi car's program dies when a TCP client disconnects, also when this one does. Its motors "
         "then stay as they are."
     )
+
+    def __init__(self, host: str, port: int) -> None:
+        self.host: Final = host
+        self.port: Final = port
 
     @classmethod
     def parse(cls, text: str) -> LinkUrl | None:
@@ -254,21 +291,22 @@ class TcpUrl(LinkUrl):
         return f"tcp://{host}:{self.port}"
 
 
-@dataclass(frozen=True, slots=True)
 class BleUrl(LinkUrl):
     """A car's Bluetooth LE module, by its address in capitals (on macOS: its UUID there) or by its name.
 
     `adapter` is the computer's adapter, such as hci1; `auto` for any with room; None for the first one.
     """
 
-    address: str | None = None
-    name: str | None = None
-    adapter: str | None = None
+    __slots__ = ("adapter", "address", "name")
     scheme = "ble"
-    same_car = MappingProxyType({"adapter": None})
     forms = ("ble://ADDRESS or ble://name=BT04",)
     options = "?adapter=hci1 or auto"
     module, extra, needs = "bleak", "ble", "Bluetooth"
+
+    def __init__(self, address: str | None = None, name: str | None = None, adapter: str | None = None) -> None:
+        self.address: Final = address
+        self.name: Final = name
+        self.adapter: Final = adapter
 
     @classmethod
     def parse(cls, text: str) -> LinkUrl | None:
@@ -286,6 +324,10 @@ class BleUrl(LinkUrl):
         """The port that it names."""
         return ("ble", self.address or "", frozenset() if self.name is None else frozenset({("name", self.name)}))
 
+    def without_options(self) -> "BleUrl":
+        """Return the link without its adapter."""
+        return BleUrl(self.address, self.name)
+
     def __str__(self) -> str:
         adapter = "" if self.adapter is None else f"?adapter={self.adapter}"
         module = self.address if self.name is None else f"name={quote(self.name, safe='')}"
@@ -302,7 +344,7 @@ LINK_HELP_OPTIONS: Final = "".join(f"; {kind.scheme}:// also with {kind.options}
 
 def car_link(url: LinkUrl) -> str:
     """Return the text of a link without the options that say nothing about which car it is: baud rate and adapter."""
-    return str(replace(url, **url.same_car))
+    return str(url.without_options())
 
 
 def parse_link(text: str) -> LinkUrl:
