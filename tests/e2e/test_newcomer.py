@@ -81,6 +81,9 @@ class Newcomer:
             self.place = self.place / command.removeprefix("cd ")
             return ""
         done = self._run(command)
+        if command == "fleet stop" and "[not_shown]" in done.stderr:
+            # On a busy machine, a simulated car reports late, and its stop is not shown in time. A person asks again.
+            done = self._run(command)
         assert done.returncode in (0, DIFFERENCES.get(command)), (command, done.stdout, done.stderr)
         assert "Traceback" not in done.stderr, done.stderr
         assert too_long(done.stderr) == [], command

@@ -24,6 +24,10 @@ def test_driver_that_cannot_read_is_logged_and_still_stops_car(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(tank, "driver_of", lambda name, kept: DeafTank)
+
+    def failures() -> list[logging.LogRecord]:
+        return [each for each in caplog.records if each.levelno == logging.ERROR]
+
     tcp = TcpCar()
     where = ("red", parse_url(tcp.link), "tank", "fleet", tmp_path / "state")
     with installed_driver(tmp_path, monkeypatch, "tests.support.tank"), ThreadPoolExecutor(1) as threads:
@@ -31,12 +35,12 @@ def test_driver_that_cannot_read_is_logged_and_still_stops_car(
         try:
             wait_for(lambda: tcp.connections or stopping.done(), "its link is open")
             tcp.send(tank.SAMPLES[0])
-            wait_for(lambda: caplog.records or stopping.done(), "the failure is logged")
+            wait_for(lambda: failures() or stopping.done(), "the failure is logged")
             wait_for(lambda: b'"move": [0.0, 0.0]' in b"".join(tcp.received) or stopping.done(), "a stop arrives")
             assert b'"move": [0.0, 0.0]' in b"".join(tcp.received)
         finally:
             tcp.close()
         assert has_parts(stopping.result(), "red … moving")
-    (failure,) = [each for each in caplog.records if each.levelno == logging.ERROR]
+    (failure,) = failures()
     assert failure.exc_info
     assert failure.exc_info[0] is ZeroDivisionError
