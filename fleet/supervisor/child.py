@@ -23,10 +23,10 @@ MAX_LOG_BYTES: Final = 1_000_000
 """Maximum size of one log file. Each process has at most two."""
 MAX_LINE_BYTES: Final = 65_536
 MAX_RUN_DIRECTORIES: Final = 10
-"""Maximum number of run directories, not counting directories that may be in use."""
+"""Number of run directories that are kept. Older ones are removed, unless they may be in use."""
 RUN_IN_USE_S: Final = 3600.0
 """A run directory that was changed within this time may be in use and is not removed."""
-_LOGGED: Final = re.compile(r"\d\d:\d\d:\d\d \S+ (?P<level>[A-Z]+) (?P<words>.*)")
+_GATEWAY_LOG_LINE: Final = re.compile(r"\d\d:\d\d:\d\d \S+ (?P<level>[A-Z]+) (?P<words>.*)")
 """A line of a gateway's log, as gateway/cli.py formats it."""
 
 
@@ -38,17 +38,19 @@ class Log(RotatingFileHandler):
         self.path = path
         self.older = path.with_suffix(".log.1")
         self.failed = ""
-        """Error of the last line, if it was not written."""
+        """Why a line could not be written. Empty if all lines were written."""
 
     def add(self, line: str, now: float) -> None:
         """Add a line. `now` is in s since the epoch."""
         stamp = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(now)) + f".{int(now % 1 * 1000):03d}Z"
-        text = f"{stamp} {self.path.stem.lstrip('@')} | {line}"
+        name = self.path.stem.lstrip("@")  # the names of services begin with @
+        text = f"{stamp} {name} | {line}"
         self.handle(logging.makeLogRecord({"msg": text}))
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: ARG002, N802 - logging calls it so
         """Note why the line was not written. A full disk must not end the supervisor."""
-        self.failed = f"{self.path} cannot be written: {getattr(sys.exception(), 'strerror', sys.exception())}"
+        error = sys.exception()
+        self.failed = f"{self.path} cannot be written: {getattr(error, 'strerror', error)}"
 
 
 def parse_log_line(line: str) -> dict[str, str]:
@@ -78,7 +80,7 @@ def new_run(fleet: str, endpoint: str, now: float) -> Path:
 
 
 def write_copy(directory: Path, name: str, text: str) -> Path:
-    """Write a file that is named by the hash of its text, unless it exists. Raises OSError."""
+    """Write a text to a file whose name contains its hash, unless that file exists. Raises OSError."""
     data = text.encode()
     path = directory / f"{name}-{hashlib.sha256(data).hexdigest()[:12]}.yaml"
     if not path.is_file():
@@ -87,7 +89,10 @@ def write_copy(directory: Path, name: str, text: str) -> Path:
 
 
 def remove_links(directory: Path) -> None:
-    """Remove the symlinks to the terminals of a simulator that has ended. Another car may get such a terminal next."""
+    """Remove the symlinks to the terminals of a simulator that has ended.
+
+    The system may give the same terminals to other cars.
+    """
     for path in directory.glob("*.tty"):
         with contextlib.suppress(OSError):
             path.unlink()
@@ -164,8 +169,8 @@ class Child:
         on_exit(code)
 
     def _on_stderr_line(self, line: str) -> None:
-        as_text = _LOGGED.fullmatch(line)
-        logged = json_log.message_in(line) if as_text is None else (as_text["level"], as_text["words"])
+        found = _GATEWAY_LOG_LINE.fullmatch(line)
+        logged = (found["level"], found["words"]) if found else json_log.message_in(line)
         if logged is None:
             self.last = line
         elif logged[0] in ("ERROR", "CRITICAL"):

@@ -39,7 +39,7 @@ from fleet.supervisor.spec import (
     CarProcessSpec,
     FleetSpec,
 )
-from fleet.supervisor.supervisor_service import ReloadRefused, RestartNeeded, SupervisorService
+from fleet.supervisor.supervisor_service import CommandRefused, RestartNeeded, SupervisorService
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.identity import Service, service
@@ -161,8 +161,8 @@ class Supervisor:
                 self._say("end", SELF, "no car had been started")
                 return True
             service = self._service = SupervisorService(bus, self._spec.fleet)
-            services = {"down": self._down, "reload": self._reload}
-            await service.open(self._on_message, services, self.status, self._refusal)
+            handlers = {"down": self._down, "reload": self._reload}
+            await service.open(self._on_message, handlers, self.status, self._refusal)
             if not self._shutdown_requested.is_set():
                 self._populate()
             self._state = RunState.RUNNING
@@ -589,7 +589,7 @@ class Supervisor:
     async def _reload(self, sender: str) -> str:
         """Read the spec again and apply it as far as possible. Return the changes in words.
 
-        Raises ReloadRefused if nothing was changed, RestartNeeded if only a part was.
+        Raises CommandRefused if nothing was changed, RestartNeeded if only a part was.
         """
         async with self._reloading:
             return await self._reload_alone(sender)
@@ -598,17 +598,17 @@ class Supervisor:
         try:
             new = await asyncio.to_thread(self._read)
         except BadFile as error:
-            raise ReloadRefused(f"{error}\nNothing was changed.") from None
+            raise CommandRefused(f"{error}\nNothing was changed.") from None
         except ValueError as error:
-            raise ReloadRefused(f"nothing was changed: {error}") from None
+            raise CommandRefused(f"nothing was changed: {error}") from None
         if self._shutdown_requested.is_set():
-            raise ReloadRefused("nothing was changed: the fleet is ending")
+            raise CommandRefused("nothing was changed: the fleet is ending")
         old, found = self._spec, compare(self._spec, new)
         try:
             command = self._coordinator(found.spec)  # this may fail, so do it before any change
         except OSError as error:
             why = f"the coordinator's copies cannot be written in {self.processes.directory}: {error.strerror}"
-            raise ReloadRefused(f"nothing was changed: {why}") from None
+            raise CommandRefused(f"nothing was changed: {why}") from None
         words = list(found.words)
         self._spec = found.spec
         for name in found.removed:

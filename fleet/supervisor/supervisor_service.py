@@ -30,7 +30,7 @@ from schemas.topics import Qos
 from schemas.words import Phase, Rank, Reason
 
 SECOND_CHECK_DELAY_S: Final = 0.3
-"""Delay of the second search for other supervisors. Two that start at once have then both declared themselves."""
+"""Delay before the second search for other supervisors. If two start at once, both are on the bus by then."""
 SERVICE_QUERY_TIMEOUT_S: Final = 2.0
 SUBSCRIPTIONS: Final = (
     "*/state/*",
@@ -50,17 +50,17 @@ class AnotherSupervisor(Exception):
     """The fleet already has a supervisor. The text names it."""
 
 
-class ReloadRefused(Exception):
-    """A command cannot be carried out. The text gives the reason and says that nothing has changed."""
+class CommandRefused(Exception):
+    """A command is refused, and nothing has changed. The text says why."""
 
 
 class RestartNeeded(Exception):
     """A part of a reload needs a restart of the fleet. The rest is done. The text names both."""
 
 
+CommandHandler = Callable[[str], Awaitable[str]]
+"""Carries out a command of the given sender and returns words for the reply. Raises CommandRefused, RestartNeeded."""
 _log: Final = logging.getLogger(__name__)
-Service = Callable[[str], Awaitable[str]]
-"""Carries out a command of the given sender and returns words for the reply. Raises ReloadRefused, RestartNeeded."""
 
 
 class SupervisorService:
@@ -77,20 +77,20 @@ class SupervisorService:
     async def open(
         self,
         on_message: Callable[[str, str, Any], object],
-        services: Mapping[str, Service],
+        handlers: Mapping[str, CommandHandler],
         status: Callable[[], pb.Supervision],
         refusal: Callable[[str], str],
     ) -> None:
         """Declare everything. Raises AnotherSupervisor.
 
-        on_message: called with car, topic and message. refusal: returns why a person with a certificate may not send a
-        command. The text is empty if they may.
+        on_message: called with car, topic and message. refusal: called with a person who has a certificate. It returns
+        why this person may not send a command, or an empty text.
         """
         loop = asyncio.get_running_loop()
         singleton = Singleton(self.bus, self._key("status"), self._another_supervisor)
         await asyncio.to_thread(singleton.check_alone)
 
-        def take(sample: Sample) -> None:
+        def on_sample(sample: Sample) -> None:
             key = keys.parse(sample.key)
             try:
                 value = sample.message()
@@ -99,25 +99,25 @@ class SupervisorService:
             if key is not None:
                 on_message(key.car, key.topic, value)
 
-        def answer(query: zenoh.Query) -> None:
+        def on_status_query(query: zenoh.Query) -> None:
             with query:
                 message = status()
                 message.car, message.boot_id = keys.SUPERVISOR, self.bus.boot_id
                 reply_value(query, self._key("status"), message.SerializeToString(), SUPERVISOR_STATUS)
 
-        samples: Handover[Sample] = Handover(loop, take, limit=MAX_QUEUED_SAMPLES)
-        questions: Handover[zenoh.Query] = Handover(loop, answer, limit=MAX_SUPERVISOR_QUERIES)
-        work: set[asyncio.Task[None]] = set()
+        tasks: set[asyncio.Task[None]] = set()
 
-        def command(query: zenoh.Query) -> None:
-            task = loop.create_task(self._on_command(query, services, refusal))
-            work.add(task)
-            task.add_done_callback(work.discard)
+        def on_command_query(query: zenoh.Query) -> None:
+            task = loop.create_task(self._on_command(query, handlers, refusal))
+            tasks.add(task)
+            task.add_done_callback(tasks.discard)
 
-        commands: Handover[zenoh.Query] = Handover(loop, command, limit=MAX_SUPERVISOR_QUERIES)
-        self.bus.queryable(self._key("status"), questions)
+        samples: Handover[Sample] = Handover(loop, on_sample, limit=MAX_QUEUED_SAMPLES)
+        status_queries: Handover[zenoh.Query] = Handover(loop, on_status_query, limit=MAX_SUPERVISOR_QUERIES)
+        command_queries: Handover[zenoh.Query] = Handover(loop, on_command_query, limit=MAX_SUPERVISOR_QUERIES)
+        self.bus.queryable(self._key("status"), status_queries)
         for expression in keys.command_keys(self.fleet, keys.SUPERVISOR):
-            self.bus.queryable(expression, commands)
+            self.bus.queryable(expression, command_queries)
         self.bus.token(keys.car_token(self.fleet, keys.SUPERVISOR))
         for expression in SUBSCRIPTIONS:
             self.bus.subscribe(f"{self.fleet}/{expression}", samples)
@@ -147,7 +147,8 @@ class SupervisorService:
 
     def stop_all(self) -> None:
         """Stop every car with one query. Call it on a thread."""
-        # Stop as a coordinator. A stop by a person or a script would put the cars on hold, even for the next start.
+        # Stop as a coordinator. A stop by a person or a script would put the cars on hold, and the hold would last into
+        # the next run.
         command = pb.StopCommand(sender="supervisor", kind=Rank.COORDINATOR, id=uuid.uuid4().hex)
         key = keys.command_key(self.fleet, "*", Verb.STOP, self.bus.identity)
         encoding = messages.encoding_of(COMMANDS[Verb.STOP].message)
@@ -155,7 +156,7 @@ class SupervisorService:
             pass
 
     async def _on_command(
-        self, query: zenoh.Query, services: Mapping[str, Service], refusal: Callable[[str], str]
+        self, query: zenoh.Query, handlers: Mapping[str, CommandHandler], refusal: Callable[[str], str]
     ) -> None:
         """Carry out a command and reply in the encoding of the query."""
         key = str(query.key_expr)
@@ -163,10 +164,10 @@ class SupervisorService:
         encoding = str(query.encoding) if query.encoding is not None else ""
         result = pb.Result(car=keys.SUPERVISOR, status=Phase.SENT)
         try:
-            command = self._command(query, verb, encoding)
+            command = self._parse_command(query, verb, encoding)
             result.id = command.id
-            result.words = await services[verb](_proven(identity, command.sender, verb, refusal))
-        except (ReloadRefused, messages.BadPayload) as error:
+            result.words = await handlers[verb](_proven_sender(identity, command.sender, verb, refusal))
+        except (CommandRefused, messages.BadPayload) as error:
             result.status, result.reason, result.words = Phase.REJECTED, Reason.BAD_VALUE, str(error)
         except RestartNeeded as error:
             result.status, result.words = Phase.FAILED, str(error)
@@ -177,37 +178,39 @@ class SupervisorService:
         with query:
             reply_message(query, key, result, as_json=is_json_wanted(query))
 
-    def _command(self, query: zenoh.Query, verb: str, encoding: str) -> Any:
+    def _parse_command(self, query: zenoh.Query, verb: str, encoding: str) -> Any:
         if verb not in SUPERVISOR_COMMANDS:
-            raise ReloadRefused(f"There is no command {verb}. There are {', '.join(SUPERVISOR_COMMANDS)}.")
+            raise CommandRefused(f"There is no command {verb}. There are {', '.join(SUPERVISOR_COMMANDS)}.")
         if query.payload is None:
-            raise ReloadRefused("The payload is missing. Send a message: {} is enough.")
+            raise CommandRefused("The payload is missing. Send a message: {} is enough.")
         return messages.parse(SUPERVISOR_COMMANDS[verb], query.payload.to_bytes(), encoding)
 
     def _another_supervisor(self, other: Any) -> AnotherSupervisor:
         return AnotherSupervisor(
             f"{keys.describe_fleet(self.fleet).capitalize()} is up already: process {other.pid} on {other.host} "
-            f"({other.fleet_file or 'simulated cars'}). End it first: `fleet down`. Or name this one with --fleet."
+            f"({other.fleet_file or 'simulated cars'}). End it with `fleet down`, or give this fleet another name with "
+            "--fleet."
         )
 
 
-def _proven(identity: str, sender: str, verb: str, refusal: Callable[[str], str]) -> str:
+def _proven_sender(identity: str, sender: str, verb: str, refusal: Callable[[str], str]) -> str:
     """Return the sender of a command.
 
-    Raises ReloadRefused if the certificate names another sender, or if the sender may not send this command.
+    Raises CommandRefused if the certificate names another sender, or if the sender may not send this command.
     """
     try:
         sender = sender_for(identity, sender, verb)
     except NotTheSender as error:
-        raise ReloadRefused(str(error)) from None
+        raise CommandRefused(str(error)) from None
     if identity and (words := refusal(keys.person_of(sender))):
-        raise ReloadRefused(words)
+        raise CommandRefused(words)
     return sender
 
 
 def ask_service(bus: Bus, fleet: str, verb: str, sender: str, timeout_s: float = 30.0) -> Any:
     """Send a command to the supervisor. Return its fleet.v1.Result, None if no supervisor answers."""
     command = messages.message_class(SUPERVISOR_COMMANDS[verb])()
-    command.sender, command.kind, command.id = sender, Rank.PERSON, uuid.uuid4().hex  # type: ignore[attr-defined]  # ours
+    # Both messages have these fields.
+    command.sender, command.kind, command.id = sender, Rank.PERSON, uuid.uuid4().hex  # type: ignore[attr-defined]
     answers = send_command(bus, fleet, keys.SUPERVISOR, verb, command, timeout_s)
     return next((answer for answer in answers if not isinstance(answer, Failure)), None)
