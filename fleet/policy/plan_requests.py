@@ -13,11 +13,11 @@ from schemas import keys
 from schemas.rights import People
 from schemas.words import Reason
 
-GOES_ON: Final = "`fleet plan restart` or `fleet plan set` runs a plan again"
+HOW_TO_RUN_AGAIN: Final = "`fleet plan restart` or `fleet plan set` runs a plan again"
 
 
 class PlanRequest(StrEnum):
-    """A request for the plan in force, as the last part of its key."""
+    """A request for the plan in force. Its value is the last part of the key of the request."""
 
     RESTART = "restart"
     NEXT = "next"
@@ -59,14 +59,14 @@ def on_request(request: PlanRequest, plan: Plan, memory: PolicyState, by: str, n
         case PlanRequest.NEXT:
             name = _next_phase(plan, memory)
             phase = PhaseState(name, now, why=f"{keys.name_of(by)} went on to it from {memory.phase.name}")
-            return replace(memory, phase=phase), f"phase {memory.phase.name} is over: {name}"
+            return replace(memory, phase=phase), f"phase {memory.phase.name} is over. The next phase: {name}"
         case PlanRequest.STOP:
             return _stop(memory, by)
 
 
 def _next_phase(plan: Plan, memory: PolicyState) -> str:
     if memory.stopped_by:
-        raise RequestRefused(f"The plan is stopped (by {keys.name_of(memory.stopped_by)}): {GOES_ON}.")
+        raise RequestRefused(f"The plan is stopped (by {keys.name_of(memory.stopped_by)}): {HOW_TO_RUN_AGAIN}.")
     if not plan.phases:
         raise RequestRefused("The plan has no phases.")
     phase = plan.phases.get(memory.phase.name)
@@ -84,9 +84,9 @@ def _next_phase(plan: Plan, memory: PolicyState) -> str:
 def _stop(memory: PolicyState, by: str) -> tuple[PolicyState, str]:
     """Release all cars. The cars that the plan commands are first brought to rest, without a hold."""
     if memory.stopped_by:
-        return memory, f"the plan is stopped already (by {keys.name_of(memory.stopped_by)}): {GOES_ON}"
+        return memory, f"the plan is stopped already (by {keys.name_of(memory.stopped_by)}): {HOW_TO_RUN_AGAIN}"
     commanded = {each.car for each in memory.decisions.values() if each.car is not None and each.mode is not None}
     cars = sorted(commanded | memory.held_roles.keys())
     stopped = PolicyState(started_at=memory.started_at, stopped_by=by, to_rest=frozenset(cars))
     rest = f"{', '.join(cars)} brought to rest" if cars else "it commanded no car"
-    return stopped, f"the plan is stopped: {rest}. {GOES_ON}"
+    return stopped, f"the plan is stopped: {rest}. {HOW_TO_RUN_AGAIN}"
