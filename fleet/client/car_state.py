@@ -4,18 +4,18 @@ Pure: time is an argument (s, of any one clock). Lists, status, doctor, console 
 one `CarState`, so that they agree. `claims` puts it into words.
 
 **How old is a message?** Its age could count from its arrival, by our clock, or from its stamp, by the gateway's clock.
-The clocks of two computers differ by seconds. By its stamps, a car that publishes once a second could then look stale.
+The clocks of two computers differ by seconds. By stamps, a car that publishes once a second could look stale.
 So the age of a message that was published just now counts from its arrival. An answer to a query is different. It may
-have waited in a gateway that hangs, or come from a replay, and only its stamp shows its age (`age_of_answer_s`). If a
-stamp is far ahead of our clock, a clock was set back since then. Such a message counts as stale.
+have waited in a gateway that hangs, or come from a replay, and only its stamp shows its age (`age_of_answer_s`). If the
+stamp is far ahead of our clock, a clock was set back after the message was stamped. Such a message counts as stale.
 
 **Does its gateway still run?** The states of a gateway that has ended no longer count. They are kept as its last words,
-since a person wants to know them, but `of` does not return them. They are forgotten as soon as another gateway of the
-car publishes a state. A late state of the earlier gateway does not bring them back (`GatewayStarts`).
+since a person wants to know them, but `current` does not return them. They are forgotten as soon as another gateway of
+the car publishes a state. A late state of the earlier gateway does not bring them back (`GatewayStarts`).
 
-**Is the car ready, silent, unheard?** Each is a property or a method here. A command does not wait until a car has
-shown that it stops, so a car can be ready before that. But a car that nobody has heard yet, or whose gateway publishes
-nothing any more, is not ready.
+**Is the car ready, silent, unheard?** Each is a property or a method here. A car can be ready before it has shown that
+it stops, because a command does not wait for that. A car that nobody has heard yet, or whose gateway publishes nothing
+any more, is not ready.
 """
 
 from collections.abc import Iterable
@@ -96,7 +96,7 @@ class CarState(Struct):
 
     @classmethod
     def of_answers(cls, car: str, answers: Iterable[tuple[str, Reading]], now: float, *, present: bool) -> Self:
-        """Return the state of a car by the answers to queries, with their topics. `now` is in s since the epoch."""
+        """Return the state of a car from answers to queries, each with its topic. `now` is in s since the epoch."""
         state = cls(car, present)
         for topic, reading in sorted(answers, key=lambda each: each[1].time):  # the newest gateway's states come last
             state.take(topic, reading.value, now - age_of_answer_s(reading.time.timestamp(), now))
@@ -117,12 +117,14 @@ class CarState(Struct):
                 if message.boot_id == self._boot_id:  # the last words of a gateway that has just ended
                     self.newest_by_topic[topic] = Observation(message, at)
                 return False
-            boot_id = message.boot_id or self._boot_id
+            boot_id = message.boot_id or self._boot_id  # a message without one counts as the same gateway's
             if self._boot_id not in ("", boot_id):
                 self._forget_states()
             self._boot_id = boot_id
-        earlier = () if before is None or KEPT_READINGS == 1 else (*before.earlier, replace(before, earlier=()))
-        self.newest_by_topic[topic] = Observation(message, at, earlier[1 - KEPT_READINGS :])
+        earlier: tuple[Observation, ...] = ()
+        if before is not None and KEPT_READINGS > 1:
+            earlier = (*before.earlier, replace(before, earlier=()))[1 - KEPT_READINGS :]
+        self.newest_by_topic[topic] = Observation(message, at, earlier)
         return True
 
     def on_presence(self, *, present: bool) -> None:
@@ -156,7 +158,7 @@ class CarState(Struct):
         found = self.newest_by_topic.get(topic)
         return None if found is None else found.message
 
-    def of(self, topic: str) -> Any:
+    def current(self, topic: str) -> Any:
         """Return the newest message. None if there is none, or if its gateway has gone since."""
         return self.newest(topic) if self.present else None
 
@@ -186,13 +188,13 @@ class CarState(Struct):
         """Return the newest message, also of a gateway that has gone since. An empty one if there is none."""
         return self.newest(topic) or _empty(topic)
 
-    # The states of a gateway that is on the bus, such as a fleet.v1.Link. A state that is missing reads as an empty
-    # message.
-    link = property(lambda self: self.of("state/link") or _empty("state/link"))
-    mode = property(lambda self: self.of("state/mode") or _empty("state/mode"))
-    motion = property(lambda self: self.of("state/motion") or _empty("state/motion"))
-    safety = property(lambda self: self.of("state/safety") or _empty("state/safety"))
-    health = property(lambda self: self.of("state/health") or _empty("state/health"))
+    # The states that the gateway publishes, as messages such as fleet.v1.Link. An empty message stands for a missing
+    # state, and for each state of a gateway that is not on the bus.
+    link = property(lambda self: self.current("state/link") or _empty("state/link"))
+    mode = property(lambda self: self.current("state/mode") or _empty("state/mode"))
+    motion = property(lambda self: self.current("state/motion") or _empty("state/motion"))
+    safety = property(lambda self: self.current("state/safety") or _empty("state/safety"))
+    health = property(lambda self: self.current("state/health") or _empty("state/health"))
 
     # ------------------------------------------------------------------ conclusions
 
@@ -231,9 +233,10 @@ class CarState(Struct):
     def is_unheard(self) -> bool:
         """True if the link is open, but the car was not heard.
 
-        So the link is stale, or no byte has come, or the car is silent and the state of its motors is unknown.
+        It was not heard if the link is stale, if no byte has come, or if it is silent and the state of its motors is
+        unknown.
         """
-        if self.of("state/link") is None or self.link.state == LinkState.LOST:
+        if self.current("state/link") is None or self.link.state == LinkState.LOST:
             return False
         if self.link.state == LinkState.STALE or self.last_rx_s is None:
             return True
@@ -254,15 +257,15 @@ class CarState(Struct):
             return "silent: is it switched on?"
         if safety.waits_for:
             return f"waits for {safety.waits_for}"
-        # For a car that never sends anything, a gateway knows the state of the motors without a byte from it.
+        # Some cars never send a byte. So `off` and `on` count without one, but not the other states of the motors.
         heard = safety.motors in (Motors.OFF, Motors.ON) or (safety.motors and self.last_rx_s is not None)
         return None if heard else NEVER_HEARD
 
     def why_missing(self, now: float) -> str:
         """Return why the start of a fleet still waits for this car, in words. Empty if the car is ready."""
         why = self.why_not_ready(now)
-        if why is None or why:
-            return why or ""
-        if not self.link.state:
-            return "its gateway is starting"
-        return NO_ANSWER
+        if why is None:
+            return ""
+        if why:
+            return why
+        return NO_ANSWER if self.link.state else "its gateway is starting"

@@ -254,7 +254,7 @@ def _other_mode(e: CarEvidence) -> str:
 
 
 def _weak(e: CarEvidence) -> str:
-    battery = e.state.of("sensor/battery")
+    battery = e.state.current("sensor/battery")
     if battery is None or battery.level not in (BatteryLevel.LOW, BatteryLevel.CRITICAL):
         return ""
     return f"The battery is {battery.level} ({battery.voltage_v:.2f} V). Motors may not start, and the car may reset."
@@ -380,8 +380,8 @@ def diagnose(evidence: CarEvidence, options: str = "") -> list[DoctorFinding]:
 def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
     """Yield the facts known about the car, as names and texts."""
     state, claims = evidence.state, evidence.state.claims(evidence.now)
-    link, mode, safety, health = (state.of(f"state/{name}") for name in ("link", "mode", "safety", "health"))
-    battery = state.of("sensor/battery")
+    link, mode, safety, health = (state.current(f"state/{name}") for name in ("link", "mode", "safety", "health"))
+    battery = state.current("sensor/battery")
     if not state.present:
         for name, claim in claims.by_name.items():
             if claim.past is not None:

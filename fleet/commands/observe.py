@@ -142,7 +142,7 @@ def row_of(
         "reason": link.reason,
         "ready": why_not_ready is None,
         "why_not_ready": why_not_ready or "",
-        "waits_for": None if state.of("state/safety") is None else safety.waits_for,
+        "waits_for": None if state.current("state/safety") is None else safety.waits_for,
         "unheard": state.is_unheard,
         "last_rx_s": round(link.last_rx_s, 3) if link.HasField("last_rx_s") else None,
         "platform": health.platform or None,

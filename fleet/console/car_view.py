@@ -141,7 +141,7 @@ class CarView:
         """Return what the car's gateway knows, as names and texts. It is empty if the gateway is gone."""
         if self._gone_at is not None:
             return []
-        return describe_gateway(*(self.state.of(f"state/{name}") for name in ("link", "health", "safety", "mode")))
+        return describe_gateway(*(self.state.current(f"state/{name}") for name in ("link", "health", "safety", "mode")))
 
     def diagnose(self, now: float) -> dict[str, Any]:
         """Return what `fleet doctor` says of the car, as far as its messages tell.

@@ -161,10 +161,10 @@ def test_overtaken_answer_and_earlier_gateway_do_not_count() -> None:
     assert state.take("state/safety", pb.Safety(motors="off", boot_id="a"), 10.0)
     assert not state.take("state/link", pb.Link(state="lost", boot_id="a"), 9.0)
     assert state.take("state/link", pb.Link(state="quiet", boot_id="b"), 11.0)
-    assert state.of("state/safety") is None, "b has not said it"
+    assert state.current("state/safety") is None, "b has not said it"
     assert not state.take("state/safety", pb.Safety(motors="off", boot_id="a"), 11.0)
     state.on_gateway_end()
-    assert (state.of("state/link"), state.newest("state/link").state) == (None, "quiet")
+    assert (state.current("state/link"), state.newest("state/link").state) == (None, "quiet")
     assert not state.take("state/safety", pb.Safety(motors="on", boot_id="b"), 12.0)
     assert state.newest("state/safety").motors == "on", "its last words"
     assert state.claims(12.0).motors.past is not None
