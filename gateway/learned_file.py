@@ -1,7 +1,7 @@
 """Saves what was learned about one car in a small JSON file: its rhythm, its delays, and whether it can show a stop.
 
-The file belongs to the car of one platform at one link. If either changes, the file counts as that of another car. If
-the file is damaged, the gateway begins as with an unknown car.
+The file is for one platform and one link. If the car now has another platform or link, or if the file is damaged, the
+gateway does not use it and begins as with an unknown car.
 """
 
 import json
@@ -14,7 +14,7 @@ from schemas.atomic_file import DAMAGE, write_state
 T = TypeVar("T")
 
 MAX_BYTES: Final = 65536
-"""Maximum size of the file. It has some hundred bytes."""
+"""Maximum size of the file. It usually has a few hundred bytes."""
 
 
 class LearnedFile:

@@ -21,7 +21,7 @@ import serial
 from gateway.link.base import CLOSE_S, Link, LinkKind
 from gateway.link.link_errors import Busy, CannotOpen, LinkLost
 from gateway.link.serial_ports import SerialPort, serial_ports
-from gateway.link.usb import UsbSerialPort, check_same_device, choose, list_usb_ports, port_at
+from gateway.link.usb import ListedPort, check_same_device, choose, list_serial_ports, port_at
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process import port_lock
 from schemas.process.usb_bus import explain_missing_port
@@ -62,7 +62,7 @@ _EMPTY_READS_S: Final = 0.5
 _opening: Final[set[str]] = set()
 """URLs whose port a thread is opening now."""
 # After a replug, the same path may lead to another car. It must not get this car's commands.
-_first_device: Final[dict[str, UsbSerialPort]] = {}
+_first_device: Final[dict[str, ListedPort]] = {}
 """The device that was opened first for each URL."""
 # The system does not list pseudo terminals, and `gateway run` starts faster if it does not list the ports.
 _PSEUDO: Final = re.compile(r"/dev/(pts/|ttys)\d+")
@@ -285,12 +285,12 @@ class SerialLink(Link):
     def _open_port(self) -> serial.Serial:
         """Find the port again and open it. Raises CannotOpen if there is no such port, or if it does not open."""
         first = _first_device.get(str(self._url))
-        found: UsbSerialPort | None
+        found: ListedPort | None
         if isinstance(self._url, SerialUrl):
             path = self._url.path
             found = _device(path, required=first is not None)
         else:
-            found = choose(self._url, list_usb_ports())
+            found = choose(self._url, list_serial_ports())
             path = found.device
         check_same_device(self._url, path, first, found)
         try:
@@ -425,7 +425,7 @@ def _cause(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _device(path: str, *, required: bool) -> UsbSerialPort | None:
+def _device(path: str, *, required: bool) -> ListedPort | None:
     """Return the USB port at this path, or None if there is none.
 
     If the system cannot list the ports, return None as well. Raises CannotOpen instead if the port is `required`.
@@ -433,7 +433,7 @@ def _device(path: str, *, required: bool) -> UsbSerialPort | None:
     if _PSEUDO.fullmatch(path):
         return None
     try:
-        return port_at(path, list_usb_ports())
+        return port_at(path, list_serial_ports())
     except CannotOpen:
         if required:
             raise
@@ -443,7 +443,7 @@ def _device(path: str, *, required: bool) -> UsbSerialPort | None:
 def _list_ports_text() -> str:
     """Return a sentence about the serial ports of this computer, or about why the port may be missing."""
     try:
-        found = sorted(port.device for port in list_usb_ports())
+        found = sorted(port.device for port in list_serial_ports())
     except CannotOpen as error:
         return str(error)
     if missing := explain_missing_port():

@@ -19,7 +19,7 @@ LIST_ATTEMPTS: Final = 3
 LIST_RETRY_DELAY_S: Final = 0.05
 
 
-class UsbSerialPort(Struct, frozen=True):
+class ListedPort(Struct, frozen=True):
     """A serial port of this computer. vid, pid and serial are set only for a USB device that reports them."""
 
     device: str
@@ -38,9 +38,9 @@ class UsbSerialPort(Struct, frozen=True):
         return f"{self.device} ({ids}{number})"
 
 
-def list_usb_ports() -> list[UsbSerialPort]:
-    """Return the USB serial ports of this computer (slow on some systems). Raises CannotOpen if it lists none."""
-    return [UsbSerialPort(port.device, port.vid, port.pid, port.serial_number) for port in list_ports()]
+def list_serial_ports() -> list[ListedPort]:
+    """Return the serial ports of this computer (slow on some systems). Raises CannotOpen if they cannot be listed."""
+    return [ListedPort(port.device, port.vid, port.pid, port.serial_number) for port in list_ports()]
 
 
 def list_ports() -> "list[ListPortInfo]":
@@ -52,15 +52,14 @@ def list_ports() -> "list[ListPortInfo]":
         try:
             return list(system.comports())
         except (OSError, TypeError, ValueError) as error:
-            # The device was unplugged while pyserial read its entry: pyserial then parses a number that it could not
-            # read.
+            # A device was unplugged while pyserial read its entry. A number in the entry is then missing.
             failure = error
             time.sleep(LIST_RETRY_DELAY_S)
     reason = " ".join(str(failure).split()) or type(failure).__name__
     raise CannotOpen(f"the serial ports cannot be listed ({reason}): is a device just being unplugged?")
 
 
-def choose(url: UsbUrl, ports: Iterable[UsbSerialPort]) -> UsbSerialPort:
+def choose(url: UsbUrl, ports: Iterable[ListedPort]) -> ListedPort:
     """Return the only matching port. If there are none or several, the message of CannotOpen lists the ports."""
     available = sorted(ports, key=lambda port: port.device)
     fit = [port for port in available if url.fits(port.vid, port.pid, port.serial)]
@@ -76,7 +75,7 @@ def choose(url: UsbUrl, ports: Iterable[UsbSerialPort]) -> UsbSerialPort:
     raise CannotOpen(f"{url}: no such USB device is plugged in; {found}")
 
 
-def port_at(path: str, ports: Iterable[UsbSerialPort]) -> UsbSerialPort | None:
+def port_at(path: str, ports: Iterable[ListedPort]) -> ListedPort | None:
     """Return the port at a device path or symlink. None if the system does not list it."""
     try:
         real = os.path.realpath(path)
@@ -85,9 +84,7 @@ def port_at(path: str, ports: Iterable[UsbSerialPort]) -> UsbSerialPort | None:
     return next((port for port in ports if os.path.realpath(port.device) == real), None)
 
 
-def check_same_device(
-    url: SerialUrl | UsbUrl, path: str, first: UsbSerialPort | None, now: UsbSerialPort | None
-) -> None:
+def check_same_device(url: SerialUrl | UsbUrl, path: str, first: ListedPort | None, now: ListedPort | None) -> None:
     """Raise CannotOpen if the ids differ from those of the first device at this URL."""
     if first is None or first.vid is None or (now is not None and now.ids == first.ids):
         return
@@ -95,11 +92,11 @@ def check_same_device(
         return  # the caller opens it next, which raises an error that says why
     found = f"{path}, about which the system says nothing" if now is None else _named([now])
     raise CannotOpen(
-        f"{url}: another device is there, {found}; it was {_named([first])}: plug that in again, or restart this "
-        "program if it is the right one"
+        f"{url}: another device is there, {found}; it was {_named([first])}. Plug the earlier device in again, or "
+        "restart this program to use the other one"
     )
 
 
-def _named(ports: list[UsbSerialPort]) -> str:
+def _named(ports: list[ListedPort]) -> str:
     """Return the ports as one line. A device chooses its own name: replace what cannot be printed."""
     return printable(", ".join(map(str, ports)), "?")

@@ -9,14 +9,14 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from gateway.link import CannotOpen, LinkLost, open_link, parse_url
-from gateway.link.usb import UsbSerialPort, choose
+from gateway.link.usb import ListedPort, choose
 from schemas.links import SerialUrl, UsbUrl
 from tests.gateway.link.peers import PtyPeer
 
-CH340 = UsbSerialPort("/dev/ttyUSB0", 0x1A86, 0x7523)
-UNO_1 = UsbSerialPort("/dev/ttyACM0", 0x2341, 0x0043, "7573")
-UNO_2 = UsbSerialPort("/dev/ttyACM1", 0x2341, 0x0043, "9912")
-BOARD = UsbSerialPort("/dev/ttyS0")
+CH340 = ListedPort("/dev/ttyUSB0", 0x1A86, 0x7523)
+UNO_1 = ListedPort("/dev/ttyACM0", 0x2341, 0x0043, "7573")
+UNO_2 = ListedPort("/dev/ttyACM1", 0x2341, 0x0043, "9912")
+BOARD = ListedPort("/dev/ttyS0")
 THERE = [UNO_2, CH340, BOARD, UNO_1]
 PATIENCE_S = 20.0
 FRAME = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
@@ -59,12 +59,12 @@ def test_one_fits(url: UsbUrl, device: str) -> None:
         ),
         (
             UsbUrl(1),
-            [UsbSerialPort("/dev/x", 2, 3, "a\n\x1b[1m")],
+            [ListedPort("/dev/x", 2, 3, "a\n\x1b[1m")],
             "there are: /dev/x (0002:0003 serial number a??[1m)",
         ),
     ],
 )
-def test_none_or_several_is_one_line(url: UsbUrl, there: list[UsbSerialPort], words: str) -> None:
+def test_none_or_several_is_one_line(url: UsbUrl, there: list[ListedPort], words: str) -> None:
     with pytest.raises(CannotOpen) as caught:
         choose(url, there)
     assert words in str(caught.value)
@@ -75,7 +75,7 @@ def test_none_or_several_is_one_line(url: UsbUrl, there: list[UsbSerialPort], wo
 def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Return a function that sets the system's list of ports, in pyserial's own type. A real list has no PTY."""
 
-    def listed(*ports: UsbSerialPort) -> None:
+    def listed(*ports: ListedPort) -> None:
         found = []
         for port in ports:
             info = ListPortInfo(port.device)
@@ -91,7 +91,7 @@ async def test_device_that_comes_back_under_another_number_is_found(tmp_path: Pa
     (tmp_path / "ACM1").mkdir()
     first, second = PtyPeer(tmp_path / "ACM0"), PtyPeer(tmp_path / "ACM1")
     url = parse_url("serial://?vid=2341&serial=7573")
-    plug(CH340, UsbSerialPort(path(first), 0x2341, 0x0043, "7573"))
+    plug(CH340, ListedPort(path(first), 0x2341, 0x0043, "7573"))
     link = await open_link(url)
     first.die()
     plug(CH340)
@@ -100,7 +100,7 @@ async def test_device_that_comes_back_under_another_number_is_found(tmp_path: Pa
     with pytest.raises(CannotOpen, match=r"no such USB device .*: /dev/ttyUSB0"):
         await open_link(url)
     await link.close()
-    plug(UsbSerialPort(path(second), 0x2341, 0x0043, "7573"), CH340)
+    plug(ListedPort(path(second), 0x2341, 0x0043, "7573"), CH340)
     link = await open_link(url)
     second.send(FRAME)
     assert await link.read() == FRAME
@@ -123,7 +123,7 @@ async def test_device_vanishing_during_listing_costs_one_try(
         with pytest.raises(CannotOpen, match=r"cannot be listed|cannot be opened"):
             await open_link(parse_url(asked), timeout_s=PATIENCE_S)
     peer = PtyPeer(tmp_path)
-    plug(UsbSerialPort(path(peer), 0x2341, 0x0043, "7573"))
+    plug(ListedPort(path(peer), 0x2341, 0x0043, "7573"))
     link = await open_link(UsbUrl(vid=0x2341))
     await link.close()
     peer.close()
@@ -133,7 +133,7 @@ async def test_listing_that_fails_once_is_asked_for_again(
     tmp_path: Path, plug: Usb, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peer = PtyPeer(tmp_path)
-    plug(UsbSerialPort(path(peer), 0x2341, 0x0043, "7573"))
+    plug(ListedPort(path(peer), 0x2341, 0x0043, "7573"))
     whole, failures = list_ports.comports, [TypeError("half gone")]
     monkeypatch.setattr(list_ports, "comports", lambda: _raise(failures.pop()) if failures else whole())
     link = await open_link(UsbUrl(pid=0x0043))
@@ -150,7 +150,7 @@ async def test_other_usb_device_in_same_place_is_not_opened(named: str, tmp_path
     peer = PtyPeer(tmp_path)
     url = parse_url(named.replace("PATH", path(peer)))
     device = str((tmp_path / "tty").resolve())
-    first, second = (UsbSerialPort(device, 0x2341, 0x0A0A, number) for number in ("7573", "99\n12"))
+    first, second = (ListedPort(device, 0x2341, 0x0A0A, number) for number in ("7573", "99\n12"))
     plug(CH340, first)
     await (await open_link(url)).close()
     plug(CH340, second)
@@ -166,7 +166,7 @@ async def test_other_usb_device_in_same_place_is_not_opened(named: str, tmp_path
 async def test_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Usb) -> None:
     """The path is gone, or leads to a device that the system does not describe."""
     peer = PtyPeer(tmp_path)
-    plug(UsbSerialPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
+    plug(ListedPort(str((tmp_path / "tty").resolve()), 0x2341, 0x0043, "1"))
     await (await open_link(peer.url)).close()
     plug(CH340)
     with pytest.raises(CannotOpen, match=f"is there, {path(peer)}, about which "):
@@ -178,7 +178,7 @@ async def test_path_whose_device_is_not_listed_any_more(tmp_path: Path, plug: Us
 
 async def test_ports_that_say_nothing_of_themselves_are_all_the_same(tmp_path: Path, plug: Usb) -> None:
     peer = PtyPeer(tmp_path)
-    plug(UsbSerialPort(str((tmp_path / "tty").resolve())))
+    plug(ListedPort(str((tmp_path / "tty").resolve())))
     await (await open_link(peer.url)).close()
     plug(CH340)
     await (await open_link(peer.url)).close()
@@ -187,7 +187,7 @@ async def test_ports_that_say_nothing_of_themselves_are_all_the_same(tmp_path: P
 
 async def test_usb_error_names_url_and_port(tmp_path: Path, plug: Usb) -> None:
     gone = str(tmp_path / "ttyACM0")
-    plug(UsbSerialPort(gone, 1, 2, "3"))
+    plug(ListedPort(gone, 1, 2, "3"))
     with pytest.raises(CannotOpen) as caught:
         await open_link(UsbUrl(serial="3"))
     assert str(caught.value).startswith(f"serial://?serial=3: {gone}: no such port ")
