@@ -1,6 +1,6 @@
 """`fleet drive, mode, stop, estop, resume`: the commands that move cars or stop them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Never
 
 import click
@@ -53,7 +53,7 @@ examples:
     type=Duration(MAX_DRIVE_S),
     default="500ms",
     show_default=True,
-    help="How long to drive: at most 10s, or the limit of the car's gateway.",
+    help="How long to drive: at most 10s, unless the car's gateway has another limit.",
 )
 @take_option
 @json_option
@@ -142,7 +142,7 @@ def _stop(
     def act(there: Fleet) -> list[Outcome]:
         named = _named(there, cars)
         request = request_for(named)
-        return [*there.ask(request, named), *_strangers(there, request, cars)]
+        return [*there.ask(request, named), *_ask_missing_cars(there, request, cars)]
 
     with _client_that_stops(connect, fleet) as client:
         end_with(client, in_all_fleets(client, connect, cars, act), as_json=as_json)
@@ -188,20 +188,26 @@ def resume(
         raise click.UsageError("--all ends everything: leave --estops and --id out")
     if everything:
         end_with(client, client.resume(_named(client, cars), everything=True), as_json=as_json)
-    named = resolve_cars(client, cars or [ALL_CARS])
-    if not estops and not ids:
-        carry_out(client, resume_request(), named, as_json=as_json)
-    connected, by_ids = client.cars(), dict[tuple[str, ...], list[str]]()
-    for car in named:  # look at all cars before the first release, because the release of one car may free the others
+    elif estops or ids:
+        _release_estops(client, resolve_cars(client, cars or [ALL_CARS]), ids, as_json=as_json)
+    else:
+        carry_out(client, resume_request(), cars or [ALL_CARS], as_json=as_json)
+
+
+def _release_estops(client: Fleet, cars: Sequence[str], ids: tuple[str, ...], *, as_json: bool) -> None:
+    """Release the e-stops with these ids, or all e-stops of the cars without ids. Exit with the code of `end_with`."""
+    connected = client.cars()
+    cars_by_ids: dict[tuple[str, ...], list[str]] = {}
+    for car in cars:  # look at all cars before the first release, because the release of one car may free the others
         in_force = _in_force(client, car)
-        chosen = tuple(in_force if estops else [_complete_id(car, prefix, in_force) for prefix in ids])
-        if chosen or car not in connected:  # for a missing car, the outcome says so
-            by_ids.setdefault(chosen, []).append(car)
+        chosen = tuple([_complete_id(car, prefix, in_force) for prefix in ids] if ids else in_force)
+        if chosen or car not in connected:  # the outcome for a car that is not connected says that it is not
+            cars_by_ids.setdefault(chosen, []).append(car)
         else:
             click.echo(f"{car}: no e-stop is in force", err=True)
-    if not by_ids:
+    if not cars_by_ids:
         return
-    outcomes = [outcome for chosen, cars in by_ids.items() for outcome in client.ask(resume_request(chosen), cars)]
+    outcomes = [each for chosen, names in cars_by_ids.items() for each in client.ask(resume_request(chosen), names)]
     end_with(client, sorted(outcomes, key=lambda each: each.car), as_json=as_json)
 
 
@@ -223,9 +229,9 @@ def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
     return resolve_cars(client, cars) if cars and ALL_CARS not in cars else None
 
 
-def _strangers(client: Fleet, request: CommandRequest, cars: tuple[str, ...]) -> list[Outcome]:
-    """Send the request to cars that are named beside `all` but are not connected. The outcome names the likely car."""
-    wrong = [each for each in cars if each != ALL_CARS and not each.startswith("@")] if ALL_CARS in cars else []
-    connected = client.cars() if wrong else ()
-    wrong = [each for each in wrong if each not in connected]
-    return client.ask(request, wrong) if wrong else []
+def _ask_missing_cars(client: Fleet, request: CommandRequest, cars: tuple[str, ...]) -> list[Outcome]:
+    """Send the request to cars that are named beside `all` but are not connected. A mistyped name then fails."""
+    named = [each for each in cars if each != ALL_CARS and not each.startswith("@")] if ALL_CARS in cars else []
+    connected = client.cars() if named else ()
+    missing = [each for each in named if each not in connected]
+    return client.ask(request, missing) if missing else []

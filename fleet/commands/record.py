@@ -78,8 +78,9 @@ examples:
   fleet record run --sessions /media/disk --segment-time 5m
   fleet record run --site north
 
-The quota removes whole files, the oldest of all sessions first. Files around stops and marks, and around
-conditions under `pin:` in the fleet file, are removed last. Files of marked sessions are never removed."""
+The quota removes whole files, the oldest of all sessions first. It removes pinned files last: those around
+stops, marks, and times when a condition under `pin:` in the fleet file was true. It never removes files of
+marked sessions."""
 )
 @click.option(
     "--sessions",
@@ -114,7 +115,7 @@ conditions under `pin:` in the fleet file, are removed last. Files of marked ses
 @click.option(
     "--quota",
     type=SizeType(10**6),
-    help="Maximum size of all sessions in --sessions. Beyond it, the oldest minutes without a pin are removed first.",
+    help="Maximum size of all sessions in --sessions. Beyond it, the oldest files are removed, pinned ones last.",
 )
 @click.option(
     "--keep-free",
@@ -133,7 +134,7 @@ conditions under `pin:` in the fleet file, are removed last. Files of marked ses
     "--site",
     default="",
     metavar="SITE",
-    help="Record at this site, beside the main recorder, which answers all commands while it is reachable.",
+    help="Record at this site. While the main recorder is reachable, it answers all commands.",
 )
 @connect_option()
 @fleet_option()
@@ -162,14 +163,16 @@ def run(
     from fleet.recording.writing.session_writer import Options, Sync
 
     copied = {FLEET_FILE: fleet_file, PLAN_FILE: plan}
-    limits = Quota(quota or 0, session_size or 0)
-    if limits.refusal:
-        raise click.UsageError(limits.refusal)
+    size_limits = Quota(quota or 0, session_size or 0)
+    if size_limits.refusal:
+        raise click.UsageError(size_limits.refusal)
+    if segment_time is None:
+        segment_time = size_limits.segment_s(Options().segment_s)
     options = Options(
         segment_bytes=segment_size,
-        segment_s=segment_time if segment_time is not None else limits.segment_s(Options().segment_s),
+        segment_s=segment_time,
         sync=Sync(sync),
-        quota=limits,
+        quota=size_limits,
         reserve=Reserve(keep_free),
         copied={name: path for name, path in copied.items() if path is not None},
     )
@@ -251,7 +254,7 @@ def _pins_and_people(fleet_file: Path | None) -> "tuple[tuple[PinRule, ...], Cal
         # Only the rules count here: cars without a link, or a plan that is not beside the file, do no harm.
         return read_fleet(fleet_file, unbound=True, moved=True).pins, people
     except ValueError as error:  # BadFile is a ValueError
-        _warn(f"no condition under pin: in {fleet_file} is pinned: {error}")
+        _warn(f"the conditions under pin: in {fleet_file} are not used: {error}")
         return (), people
 
 
@@ -329,7 +332,7 @@ def stop(connect: str | None, fleet: str, *, as_json: bool) -> None:
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Show what is recorded now and where, at all sites, how much was lost, and whether there is room."""
+    """Show the recording of each site: its directory, how much was lost, and whether there is room."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
