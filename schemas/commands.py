@@ -111,7 +111,7 @@ _ROWS: Final = (
     CommandType(Verb.LEASE, "reserve the car for a moment, or release it", "done"),
     CommandType(
         Verb.FIND,
-        "blink, and beep if the car can, without moving: shows which car is which",
+        "blink without moving, and beep if the car can, to show which car is which",
         "blinking sent",
         subcommand="identify",
         section="Drive",

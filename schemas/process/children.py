@@ -35,7 +35,10 @@ def leave(process: "subprocess.Popen[Any]") -> None:
 
 
 def wait(process: "subprocess.Popen[Any]", timeout_s: float | None) -> int | None:
-    """Wait until a process has ended, for ever without a timeout. Return its exit code, or None if it still runs."""
+    """Wait until a process has ended. Return its exit code, or None if it still runs after `timeout_s`.
+
+    A timeout of None means no limit.
+    """
     try:
         return process.wait(timeout_s)
     except subprocess.TimeoutExpired:

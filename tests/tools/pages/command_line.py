@@ -52,7 +52,7 @@ def _index() -> str:
         "",
         "Each command has a page with its options and examples. `fleet COMMAND --help` prints the same.",
         "The exit code is 0 if all was carried out, 1 if not, 2 for wrong use, and 130 after Ctrl-C.",
-        f"[`gateway`]({GATEWAY}) has the commands for one car and for the desk.",
+        f"[`gateway`]({GATEWAY}) connects one car to the fleet, and helps with a car on the desk.",
     ]
     for heading, names in headings().items():
         rows += ["", f"## {heading}", "", "| command | what it does |", "|---|---|"]
