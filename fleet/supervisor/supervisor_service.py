@@ -58,7 +58,7 @@ class RestartNeeded(Exception):
     """A part of a reload needs a restart of the fleet. The rest is done. The text names both."""
 
 
-CommandHandler = Callable[[str], Awaitable[str]]
+SupervisorHandler = Callable[[str], Awaitable[str]]
 """Carries out a command of the given sender and returns words for the reply. Raises CommandRefused, RestartNeeded."""
 _log: Final = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ class SupervisorService:
     async def open(
         self,
         on_message: Callable[[str, str, Any], object],
-        handlers: Mapping[str, CommandHandler],
+        handlers: Mapping[str, SupervisorHandler],
         status: Callable[[], pb.Supervision],
         refusal: Callable[[str], str],
     ) -> None:
@@ -156,7 +156,7 @@ class SupervisorService:
             pass
 
     async def _on_command(
-        self, query: zenoh.Query, handlers: Mapping[str, CommandHandler], refusal: Callable[[str], str]
+        self, query: zenoh.Query, handlers: Mapping[str, SupervisorHandler], refusal: Callable[[str], str]
     ) -> None:
         """Carry out a command and reply in the encoding of the query."""
         key = str(query.key_expr)
