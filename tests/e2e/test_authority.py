@@ -68,7 +68,7 @@ def test_estop_of_all_without_id_is_one_estop(fleet: FleetProcesses) -> None:
         fleet.ready(car)
     assert len(fleet.ask_all("estop", why="smoke", scope="fleet")) == len(cars)
     wait_for(lambda: all(estops(fleet, car) for car in cars), "latched by all")
-    wait_for(lambda: len({tuple(estops(fleet, car)) for car in cars}) == 1, "the same for all")
+    wait_for(lambda: len({frozenset(estops(fleet, car)) for car in cars}) == 1, "the same for all")
     assert fleet.ask("resume", "blue", ids=estops(fleet, "red"), kind="person")["status"] == "sent"
     wait_for(lambda: not any(estops(fleet, car) for car in cars), "ended for all")
 
