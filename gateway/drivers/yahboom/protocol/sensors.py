@@ -7,9 +7,10 @@ of `SENSOR_FIELDS`, an attribute of `Sensors`, and a variable in `read_sensors`.
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from schemas.words import Cause
 
@@ -103,7 +104,7 @@ class RejectedField(Struct, frozen=True):
     cause: Cause = Cause.OUT_OF_RANGE
 
 
-class Sensors(NamedTuple):
+class Sensors(Struct, frozen=True):
     """The sensors frame, each field as on the wire. None where the field was rejected.
 
     `at` is the time of its last byte. `range_cm` 0 means no echo, not a distance. `line` is left-outer, left-inner,
@@ -112,7 +113,6 @@ class Sensors(NamedTuple):
     `modes.candidate_modes` tells which modes send this text.
     """
 
-    # A named tuple: creating a frozen dataclass of this size costs as much as decoding the frame.
     raw: bytes
     at: float
     range_cm: float | None
@@ -135,7 +135,7 @@ _RANGE, _BATTERY, _GRAYSCALE, _LINE, _OBSTACLE, _LIGHT = SENSOR_FIELDS
 _CSB_MAX, _PV_MAX, _GS_MAX = _RANGE.maximum or 0.0, _BATTERY.maximum or 0.0, _GRAYSCALE.maximum or 0.0
 # Bind these once here, because looking a method up in the function takes longer in CPython 3.11.
 _read_line, _read_obstacle, _read_light = _LINE.read, _OBSTACLE.read, _LIGHT.read
-assert tuple(field.attribute for field in SENSOR_FIELDS) == Sensors._fields[2:8], (
+assert tuple(field.attribute for field in SENSOR_FIELDS) == Sensors.__struct_fields__[2:8], (
     "Sensors: the table's fields, in order"
 )
 
@@ -152,7 +152,7 @@ def read_sensors(found: re.Match[bytes], at: float, *, terminated: bool = True, 
     rejected = [(field, text) for field, text in zip(SENSOR_FIELDS, texts, strict=True) if not field.accepts(text)]
     rejects = tuple(RejectedField(field.word.decode(), text.decode()) for field, text in rejected)
     removed: dict[str, Any] = dict.fromkeys((field.attribute for field, _ in rejected), None)
-    return reading._replace(rejects=rejects, **removed)
+    return replace(reading, rejects=rejects, **removed)
 
 
 def sensors_pattern(filler: Mapping[str, bytes] | None = None, *, head: bytes = b"[0-9A-Za-z]+") -> bytes:

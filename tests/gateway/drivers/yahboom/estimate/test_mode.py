@@ -1,6 +1,7 @@
 """Tests of the mode estimate: every way from assumed to confirmed, to contradicted and back."""
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.drivers.yahboom.estimate.learned import Learned, Rhythm
 from gateway.drivers.yahboom.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator
@@ -105,11 +106,11 @@ def test_damaged_reading_of_another_mode_does_not_confirm() -> None:
     assert only_candidate(damaged) is Mode.MANUAL
     for number in range(20):
         event = damaged if number % 5 == 2 else reading(SHAPES[Mode.TRACKING], 5.0)
-        truth.on_reading(event._replace(at=5.0 + number / 27))
+        truth.on_reading(replace(event, at=5.0 + number / 27))
         assert truth.verdict is (ASSUMED if number < 5 else CONTRADICTED), number
     for number in range(CONTRADICTING_FRAMES):
         assert truth.verdict is CONTRADICTED
-        truth.on_reading(damaged._replace(at=6.0 + number / 27))
+        truth.on_reading(replace(damaged, at=6.0 + number / 27))
     assert truth.verdict is CONFIRMED, "three running are not damaged"
 
 

@@ -36,7 +36,7 @@ BURSTS = st.lists(st.tuples(STREAM, st.sampled_from([0.0, 0.01, 0.049, 0.051, 0.
 
 
 def timeless(events: list[Event]) -> list[Event]:
-    return [event._replace(at=0.0) if isinstance(event, Sensors) else replace(event, at=0.0) for event in events]
+    return [replace(event, at=0.0) for event in events]
 
 
 def events_of(bursts: list[tuple[bytes, float]], size: int | None, *, ticks: bool) -> list[Event]:
