@@ -13,10 +13,10 @@ from fleet.recording.reading.session import Session
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import START_NS, make
+from tests.support.soaks import only_in_soak
 from tests.support.sorted_writer import SortedWriter
 
 SECONDS = 120
-MOMENTS = 25
 TRUTH, POSE = "sim/truth", "sensor/pose"
 S = 1_000_000_000
 
@@ -44,17 +44,18 @@ def told_by_tables(tables: dict[str, Any], at_ns: int) -> dict[str, list[Any]]:
     return told
 
 
-def test_map_places_equal_tables_at_random_moments(path: Path) -> None:
+@pytest.mark.parametrize("count", [25, *only_in_soak([100])])
+def test_map_places_equal_tables_at_random_moments(path: Path, count: int) -> None:
     session, chance = Session(path), random.Random(31)
     tables = {topic: session.to_pandas(topic) for topic in (TRUTH, POSE)}
     compared = 0
-    for _ in range(MOMENTS):
+    for _ in range(count):
         at_ms = START_NS // 1_000_000 + chance.randrange(-5_000, (SECONDS + 40) * 1000)
         question = {"path": str(path), "at_ms": at_ms, "colors": {}, "car": "", "series": [], "span_s": 0, "map": True}
         found = answer(question)["map"]["cars"]
         assert found == told_by_tables(tables, at_ms * 1_000_000), at_ms
         compared += len(found)
-    assert compared > MOMENTS * 2
+    assert compared > count * 2
 
 
 def truth(x_m: float) -> pb.Truth:

@@ -235,7 +235,8 @@ def test_person_steps_phase_stops_and_restarts_plan(cars: Cars, tmp_path: Path) 
 
     lines = Lines(coordinator(cars, tmp_path / "plan.yaml", PHASES))
     lines.until("red", "tracking", "role line")
-    assert plan("next").stdout.split()[-1] == "second"
+    said = plan("next").stdout.split()
+    assert (said[1], said[-1]) == ("first", "second")
     lines.until("red", "light_seeking", "role light")
     refused = plan("next")
     assert (refused.returncode, "Phase second " in refused.stderr) == (1, True)

@@ -36,6 +36,7 @@ from tests.support import in_process
 from tests.support.disk import MAY_MOUNT, disk
 from tests.support.no_superuser import no_superuser
 from tests.support.processes import wait_for
+from tests.support.soaks import only_in_soak
 from tests.support.terminal import Terminal
 
 
@@ -339,16 +340,18 @@ def no_tables(place: Path) -> bool:
     return not [*place.rglob(f"{TABLES_PREFIX}*")]
 
 
-def test_damaged_sessions_of_many_are_named_and_rest_counts(tmp_path: Path) -> None:
-    for number in range(60):
+@pytest.mark.parametrize("count", [60, *only_in_soak([300])])
+def test_damaged_sessions_of_many_are_named_and_rest_counts(tmp_path: Path, count: int) -> None:
+    damaged = range(0, count, count // 10)
+    for number in range(count):
         make(tmp_path / f"s{number:03d}", "red", [1.0])
-    for number in range(0, 60, 6):
+    for number in damaged:
         file = tmp_path / f"s{number:03d}" / "0001.mcap"
-        file.write_bytes(file.read_bytes()[:-200] if number % 12 else b"noise")
+        file.write_bytes(file.read_bytes()[:-200] if number % (count // 5) else b"noise")
     catalog = Catalog(tmp_path)
-    assert sorted(catalog.damage) == [f"s{number:03d}" for number in range(0, 60, 6)]
+    assert sorted(catalog.damage) == [f"s{number:03d}" for number in damaged]
     found = catalog.query("SELECT session FROM sensor_range GROUP BY ALL").num_rows
-    assert found == 55, "five are noise"
+    assert found == count - 5, "five are noise"
 
 
 def old_schema(session: Path, kind: int, words: str = "0.75") -> None:

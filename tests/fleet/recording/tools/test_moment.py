@@ -11,10 +11,12 @@ from fleet.recording.tools.lanes import HELD_NS, Lane
 from fleet.recording.tools.moment import known_at, lanes_of, newest_rows
 from schemas.topics import CAR_TOPICS
 from tests.fleet.replay.make_session import START_NS, make
+from tests.support.soaks import only_in_soak
 from tests.support.sorted_writer import SortedWriter
 
 SECONDS = 120
-MOMENTS = 25
+COUNTS = pytest.mark.parametrize("count", [25, *only_in_soak([100])])
+"""Number of moments."""
 TABLES = [topic for topic in CAR_TOPICS if topic.family in ("sensor", "state", "sim")]
 
 
@@ -25,21 +27,22 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return Session(path)
 
 
-def moments() -> list[int]:
+def moments(count: int) -> list[int]:
     chance = random.Random(31)
     return [
-        START_NS + chance.randrange(-5, SECONDS + 40) * 1_000_000_000 + chance.randrange(10**9) for _ in range(MOMENTS)
+        START_NS + chance.randrange(-5, SECONDS + 40) * 1_000_000_000 + chance.randrange(10**9) for _ in range(count)
     ]
 
 
-def test_past_state_equals_tables_at_random_moments(session: Session) -> None:
+@COUNTS
+def test_past_state_equals_tables_at_random_moments(session: Session, count: int) -> None:
     tables: dict[str, Any] = {topic.name: session.to_pandas(topic.name) for topic in TABLES}
     times = {
         name: (table["log_time"].astype("int64"), table["publish_time"].astype("int64"))
         for name, table in tables.items()
     }
     compared = 0
-    for at_ns in moments():
+    for at_ns in moments(count):
         found = {str(each.key): each.message.seq for each in known_at(session, at_ns) if each.key.topic in tables}
         told: dict[str, int] = {}
         for name, table in tables.items():
@@ -49,14 +52,15 @@ def test_past_state_equals_tables_at_random_moments(session: Session) -> None:
                 told[str(key)] = int(rows["sequence"].loc[published[rows.index].idxmax()])
         assert found == told, at_ns
         compared += len(told)
-    assert compared > MOMENTS * 20
+    assert compared > count * 20
 
 
-def test_lanes_equal_tables_at_random_moments(session: Session) -> None:
+@COUNTS
+def test_lanes_equal_tables_at_random_moments(session: Session, count: int) -> None:
     modes, lanes = session.to_pandas("state/mode"), lanes_of(session)
     by_log = modes.assign(log_ns=modes["log_time"].astype("int64")).sort_values("log_ns")
     seen = set()
-    for at_ns in moments():
+    for at_ns in moments(count):
         told = {}
         for car, rows in by_log.groupby("car"):
             before, after = rows[rows["log_ns"] <= at_ns], rows[rows["log_ns"] >= at_ns]
