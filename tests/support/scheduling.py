@@ -63,8 +63,9 @@ def computes(nodeid: str) -> bool:
 
 def sort(items: list[pytest.Item]) -> None:
     """Put tests that compute last, where workers in the background take them. Put large groups first."""
-    sizes = Counter(_group(item) for item in items)
-    items.sort(key=lambda item: (computes(item.nodeid), -sizes[_group(item)] if _group(item) else 0))
+    groups = {item: _group(item) for item in items}
+    sizes = Counter(filter(None, groups.values()))
+    items.sort(key=lambda item: (computes(item.nodeid), -sizes[groups[item]]))
 
 
 def _group(item: pytest.Item) -> str:
