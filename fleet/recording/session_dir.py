@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from msgspec import Struct, field
+from msgspec.structs import asdict
 
 from fleet.recording.time_spec import format_utc, iso
 from schemas.atomic_file import write_atomically
@@ -107,7 +108,7 @@ class SessionInfo(Struct):
 
         If the disk is full, use the reserved space.
         """
-        values = {name: getattr(self, name) for name in self.__struct_fields__}
+        values = asdict(self)
         try:
             replace(directory / SESSION_FILE, values, indent=2)
         except OSError as error:
