@@ -28,6 +28,7 @@ from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
 from schemas.bus.sample import Failure, Sample, sample_of, session_of, unread
+from schemas.bus.session_link import SessionLink
 from schemas.keys import renewal_key
 from schemas.process import signals
 from schemas.topics import Qos, Topic
@@ -67,6 +68,7 @@ class Bus:
 
     def __init__(self, session: zenoh.Session, endpoint: str, identity: str = "") -> None:
         self._session = self._declaring = session
+        self._link = SessionLink(session)
         self.identity = identity
         """Owner of this session's certificate, such as `person.mia`. Empty on a bus without certificates."""
         self._declarations: list[Declared] = []
@@ -255,7 +257,7 @@ class Bus:
         with self._changing:
             for publisher in self._publishers:
                 publisher.move()
-            self._session = second
+            self._session, self._link = second, SessionLink(second)
             assert self._overlap is not None
             self._overlap.older_is_deaf = True
         self._closing.wait(overlap_s)
@@ -390,7 +392,7 @@ class Bus:
         wanted, end = zenoh.KeyExpr(expression), monotonic() + timeout_s
         link_end = min(end, monotonic() + LINK_TIMEOUT_S)
         while True:
-            asked_at, link, asked_over = monotonic(), self._link(), self._asked_over
+            asked_at, link, asked_over = monotonic(), self._link.address, self._asked_over
             with self._lock:
                 if expression in self._alive and link in ("", asked_over):
                     return sorted(self._alive[expression])
@@ -406,15 +408,11 @@ class Bus:
             self._asked_over = link
             now = monotonic()
             is_prompt = now - asked_at < _PROMPT_S
-            is_whole = is_prompt and link == self._link() and (link == asked_over or not is_watching)
+            is_whole = is_prompt and link == self._link.address and (link == asked_over or not is_watching)
             if is_whole or now >= (end if link else link_end):
                 return sorted(found)
             if not is_prompt:
                 self._closing.wait(_END_OF_LINK_S)
-
-    def _link(self) -> str:
-        """Return the address of our end of the link to the hub, which no two links share. Empty if there is none."""
-        return next((str(link.src) for link in self._session.info.links()), "")
 
     def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> None:
         """Call back with (key, alive) for every existing token and every change, on a Zenoh thread."""

@@ -28,6 +28,12 @@ class TcpProxy:
                 each.shutdown(socket.SHUT_RDWR)
             each.close()
 
+    def hang_up(self) -> None:
+        """End all connections. The next one is accepted."""
+        for each in self._sockets:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
     def on_bytes(self, data: bytes, connection: int, *, from_client: bool) -> None:
         """Handle bytes before they are passed on. Connections are counted from 0."""
 
