@@ -22,7 +22,7 @@ import zenoh
 from msgspec import Struct, field
 
 from gateway import drivers
-from gateway.bus.car_publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of, shown_state
+from gateway.bus.car_publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of
 from gateway.bus.car_service import AlreadyServed, CarService
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
@@ -338,7 +338,6 @@ class CarGateway:
                 self._publisher.on_bus_lost(now)
                 self._hub_lost.set()
             self._link.check(now)
-            before = shown_state(self._driver.model)
             self._control.tick(now)
             self._wake.set_if_due(now)
             model = self._driver.model
@@ -349,7 +348,7 @@ class CarGateway:
                 why_quiet=model.why_quiet,
                 is_heard=model.is_heard,
             )
-            if changed or shown_state(model) != before or now >= next_health:
+            if changed or self._publisher.is_outdated or now >= next_health:
                 self._publish_states(now)
             if now >= next_health:
                 self._save_learned(now)
@@ -369,7 +368,8 @@ class CarGateway:
         gap_s = now - self._alive_at - TICK_S
         if gap_s > BUS_LOSS_GAP_S:
             self._publisher.on_bus_lost(now)
-        self._driver.on_stall(gap_s, now)
+        if gap_s > 0:
+            self._driver.on_stall(gap_s, now)
 
     def _save_learned(self, now: float, *, at_once: bool = False) -> None:
         """Save what was learned about the car for its next gateway."""

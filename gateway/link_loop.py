@@ -9,7 +9,7 @@ import random
 from collections.abc import Awaitable, Callable
 from typing import Final
 
-from gateway.bus.car_publisher import RAW_PER_S, CarPublisher, shown_state
+from gateway.bus.car_publisher import RAW_PER_S, CarPublisher
 from gateway.bus.command_handler import CommandHandler
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Echo, Event, Rejected, TextLine
@@ -129,7 +129,6 @@ class LinkLoop:
             read_at = now = self._loop.time()
             self.health.on_bytes(len(data), now)
             self._on_gap(now)  # first, because reports that are read late may look like a block gap of the car
-            before = shown_state(self._driver.model)
             for start in range(0, len(data), SLICE_BYTES):
                 if start:
                     await asyncio.sleep(0)
@@ -142,7 +141,7 @@ class LinkLoop:
             if (doubt := self._baud.on_bytes(data)) is not None:
                 self.health.on_rejected(doubt.cause, 1)
                 self._commands.log(Level.WARNING, "no_frames", doubt.words)
-            if shown_state(self._driver.model) != before:
+            if self._publisher.is_outdated:
                 self._wake.set()
             self._wake.set_if_due(now)
 

@@ -63,6 +63,8 @@ class CarPublisher:
         self._histories: dict[str, HistoryBuffer] = {}
         self._published_states: dict[str, tuple[object, ...]] = {}
         self._published_at: dict[str, float] = {}
+        self._shown: tuple[object, ...] = ()
+        """`shown_state` when the states were last published."""
         for topic in topics.CAR_TOPICS:
             if topic.family == "sim":
                 continue
@@ -202,12 +204,18 @@ class CarPublisher:
 
     # ------------------------------------------------------------------ states
 
+    @property
+    def is_outdated(self) -> bool:
+        """True if a reading or a silence has changed a state since the last `publish_states`."""
+        return shown_state(self._driver.model) != self._shown
+
     def publish_states(
         self, control: Controller[Driver], health: LinkHealth, now: float, *, force: bool = False
     ) -> None:
         """Publish each state that changed, and all of them once a second."""
         model, safety = control.driver.model, control.safety
         mode = model.mode
+        self._shown = shown_state(model)
         lease = safety.lease_at(now)
         changes: dict[str, tuple[object, ...]] = {
             "state/link": (health.state, health.reconnects, health.state is LinkState.LOST and health.reason),

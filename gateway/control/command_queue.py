@@ -60,6 +60,11 @@ class CommandQueue(Struct):
     one_shots: deque[Pending] = field(default_factory=deque)
 
     @property
+    def has_commands(self) -> bool:
+        """Return True if there is a motion, a mode or a one-shot."""
+        return self.held is not None or self.mode_change is not None or bool(self.one_shots)
+
+    @property
     def held_until(self) -> float:
         """Return when the held motion ends, by its duration or by the loss of its sender, or inf if none is held."""
         held = self.held
@@ -67,6 +72,8 @@ class CommandQueue(Struct):
 
     def deadlines(self) -> list[float]:
         """Return when the queued commands expire."""
+        if not self.has_commands:
+            return []
         waiting = [*self.one_shots, *([self.mode_change] if self.mode_change is not None else [])]
         times = [pending.waits_since + MAX_QUEUE_TIME_S for pending in waiting]
         return times if self.held is None else [*times, self.held_until]

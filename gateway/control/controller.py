@@ -395,8 +395,7 @@ class Controller(Generic[D_co]):
     def _clear_for(self, words: str, now: float) -> None:
         """End the lease, and stop the car unless it is at rest, because from now on somebody else may drive it."""
         self.safety.lease = None
-        waiting = self._queue.held is not None or self._queue.mode_change is not None or self._queue.one_shots
-        if waiting or not self.driver.model.at_rest:
+        if self._queue.has_commands or not self.driver.model.at_rest:
             self.halt(words, now)
 
     def _still_estopped(self, sender: Sender, now: float) -> str:

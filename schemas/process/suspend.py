@@ -14,9 +14,8 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from math import inf
 from typing import Final
-
-from msgspec import Struct
 
 if sys.platform == "win32":
     import ctypes
@@ -64,45 +63,41 @@ def clock_pair() -> ClockPair | None:
     return with_sleep, awake
 
 
-class _Reading(Struct):
-    """Bounds of the time that the computer has slept since its start, s."""
-
-    at_least: float
-    at_most: float
-
-
 class SleepWatch:
     """Measures the sleeps of the computer. If `clocks` is None, no sleep is noticed.
 
-    A process may be interrupted between its readings of the two clocks. So the clock without sleep is read before and
-    after the other one. Only a difference that is certainly a sleep counts; an interruption never does.
+    A process may be interrupted between its readings of the two clocks. So the clock without sleep is read first at the
+    start, and last in `take`. Only a difference that is certainly a sleep counts; an interruption never does.
     """
 
     def __init__(self, clocks: ClockPair | None) -> None:
         self._clocks = clocks
         self._slept_s = 0.0
         if clocks is not None:
-            best = self._read(clocks)
-            for _ in range(MAX_READS - 1):
-                if best.at_most - best.at_least <= MAX_READ_S:
-                    break
-                best = min(best, self._read(clocks), key=lambda each: each.at_most - each.at_least)
-            self._slept_s = best.at_most
+            self._slept_s = _slept_until_now(*clocks)
 
     def take(self) -> float:
         """Return how long the computer has slept since the last call (s), or 0 if it has not."""
         if self._clocks is None:
             return 0.0
-        found = self._read(self._clocks)
-        slept_s = found.at_least - self._slept_s
+        with_sleep, awake = self._clocks
+        at_least_s = with_sleep() - awake()  # an interruption between the two makes this less
+        slept_s = at_least_s - self._slept_s
         if slept_s < MIN_SLEEP_S:
             return 0.0
-        self._slept_s = found.at_least
+        self._slept_s = at_least_s
         return slept_s
 
-    @staticmethod
-    def _read(clocks: ClockPair) -> _Reading:
-        with_sleep, awake = clocks
+
+def _slept_until_now(with_sleep: Callable[[], float], awake: Callable[[], float]) -> float:
+    """Return at most how long the computer has slept since its start, s, by the best of several readings."""
+    best_took_s, at_most_s = inf, 0.0
+    for _ in range(MAX_READS):
         before = awake()
         total = with_sleep()
-        return _Reading(total - awake(), total - before)
+        took_s = awake() - before
+        if took_s < best_took_s:
+            best_took_s, at_most_s = took_s, total - before
+        if took_s <= MAX_READ_S:
+            break
+    return at_most_s

@@ -83,19 +83,20 @@ class CarMonitor:
             model.evidence.on_noise(event.at, damaged=event.cause is not Cause.NO_START)
         if not isinstance(event, Sensors):
             return
-        before, silent_s = model.mode.verdict, model.mode.unheard_s(event.at)
+        was_silent = self._silent_since is not None or model.trust.state is CarTrust.UNHEARD
+        before, silent_s = model.mode.verdict, model.mode.unheard_s(event.at) if was_silent else 0.0
         model.mode.on_reading(event, counts=is_credible)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
         # Stop the car after a silence, because a command may have been sent during it.
-        if self._silent_since is not None or model.trust.state is CarTrust.UNHEARD:
+        if was_silent:
             self._silent_since = None
             # Allow such a silence. Otherwise, if a `MODE00` delays the report for longer than expected, each silence
             # would cause the next `MODE00`, for ever.
             model.mode.allow_silence(silent_s)
             self._on_contact(now)
         finding = model.evidence.on_reading(event)
-        if model.stop_style is StopStyle.TIMER and Blocking.MODE_CLOSE in model.learned.blocks:
+        if Blocking.MODE_CLOSE in model.learned.blocks and model.stop_style is StopStyle.TIMER:
             words = f"its reports come late after MODE00, unlike those of {model.profile.name} cars"
             if model.platform.note(words):
                 self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
@@ -191,9 +192,10 @@ class CarMonitor:
     @property
     def _is_idle(self) -> bool:
         """Return True if no command waits, and the car neither drives nor is in a mode."""
-        queue = self._executor.queue
-        waits = queue.held is not None or queue.mode_change is not None or bool(queue.one_shots)
-        return not waits and self.model.trust.state not in (CarTrust.DRIVING, CarTrust.IN_MODE)
+        return not self._executor.queue.has_commands and self.model.trust.state not in (
+            CarTrust.DRIVING,
+            CarTrust.IN_MODE,
+        )
 
     def tick(self, now: float) -> None:
         """Check for silence, and for a detected platform. It is called several times a second."""

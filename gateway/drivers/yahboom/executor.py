@@ -166,10 +166,11 @@ class Executor(Driver):
     def _next_mode(self) -> Pending | None:
         """Return the waiting mode if it goes before the actions on parts of the car, else None."""
         change = self.queue.mode_change
+        if change is None or not self._may_overtake(change):
+            return None
         # Queued actions go before the mode, because the car would ignore them in the mode.
         stands = self.model.at_rest or self._full_stop_runs
-        waits = change is None or (self.queue.has_undelayed and stands) or not self._may_overtake(change)
-        return None if waits else change
+        return None if self.queue.has_undelayed and stands else change
 
     def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
         """Open a mode, but stop the car first, because a mode that is opened during a drive leaves the motors on."""
@@ -467,19 +468,28 @@ class Executor(Driver):
         return max(now, min(times, default=float("inf")))
 
     def _command_times(self, now: float) -> list[float]:
-        model, queue = self.model, self.queue
-        times: list[float] = []
-        running = self.stops.running
-        stopped = running is None
+        model, queue, running = self.model, self.queue, self.stops.running
         if running is not None and self.stops.shutting_down:
-            return times
+            return []
+        times = self._waiting_times(now) if queue.has_commands else []
+        if running is None and self._repeats(max(now, model.pacing.repeat_at)):
+            times.append(max(model.pacing.repeat_at, model.mode_left_by))
+        if self._renews and queue.mode_change is None:
+            times.append(max(self.stops.renewal.due_at, model.ready_at))
+        return times
+
+    def _waiting_times(self, now: float) -> list[float]:
+        """Return when the commands of the queue may have their next frames written."""
+        model, queue, running = self.model, self.queue, self.stops.running
+        times: list[float] = []
         free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
         actions_wait = self._actions_wait(now)
-        times.extend(
-            max(each.due_at, self._act_at(each), model.mode_left_by, free_at)
-            for each in (queue.turns if self._next_mode is None and not actions_wait else ())
-            if self._may_overtake(each)
-        )
+        if queue.one_shots and self._next_mode is None and not actions_wait:
+            times.extend(
+                max(each.due_at, self._act_at(each), model.mode_left_by, free_at)
+                for each in queue.turns
+                if self._may_overtake(each)
+            )
         if queue.held is not None and not queue.held.pending.sent and self._may_overtake(queue.held.pending):
             times.append(max(model.ready_at, free_at))
         change = self._next_mode if actions_wait else queue.mode_change
@@ -487,8 +497,4 @@ class Executor(Driver):
             opens = model.rest_is_sure or self._full_stop_runs
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))
-        if stopped and self._repeats(max(now, model.pacing.repeat_at)):
-            times.append(max(model.pacing.repeat_at, model.mode_left_by))
-        if self._renews and queue.mode_change is None:
-            times.append(max(self.stops.renewal.due_at, model.ready_at))
         return times

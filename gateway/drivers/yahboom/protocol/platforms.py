@@ -5,7 +5,7 @@ Every number cites its row of docs/reference/protocol.md. The times are in `timi
 
 from collections.abc import Mapping
 from enum import StrEnum
-from functools import cache
+from functools import cache, cached_property
 from typing import Final
 
 from msgspec import Struct
@@ -123,7 +123,7 @@ def _common_measurements(modes: tuple[Mode, ...], shown: tuple[Mode, ...]) -> fr
     return common
 
 
-class Profile(Struct, frozen=True):
+class Profile(Struct, frozen=True, dict=True):
     """One kind of car: a column of the table in docs/reference/protocol.md#platforms."""
 
     kind: Platform
@@ -137,7 +137,7 @@ class Profile(Struct, frozen=True):
     constants: tuple[tuple[str, float], ...] = ()  # readings that are constants in mode 0
     not_observed: tuple[str, ...] = ()  # properties that were only read or assumed, for a person
 
-    @property
+    @cached_property
     def name(self) -> str:
         """The text that `parse_platform` accepts."""
         return "+".join((self.kind, *sorted(self.options)))
@@ -147,7 +147,7 @@ class Profile(Struct, frozen=True):
         """True if all of this profile was observed on a running program."""
         return not self.not_observed
 
-    @property
+    @cached_property
     def dialect(self) -> Dialect:
         """The spelling of the car's frames, for `Decoder` and `encode`."""
         head = next((option.partition("=")[2] for option in self.options if option.startswith(HEAD)), STANDARD_HEAD)
@@ -163,7 +163,7 @@ class Profile(Struct, frozen=True):
         """True if the servo goes to the angle of a PTZ frame. False if it goes to 180 degrees minus it."""
         return "ptz_direct" in self.options
 
-    @property
+    @cached_property
     def has_readings(self) -> bool:
         """False if the car never sends a reading."""
         return NO_READINGS not in self.options
@@ -183,17 +183,17 @@ class Profile(Struct, frozen=True):
         """Always None, because no such car stops by itself (docs/reference/protocol.md#stops)."""
         return None
 
-    @property
+    @cached_property
     def voltage_max(self) -> float:
         """The maximum of PV, V. A greater value is not a measurement."""
         return _PV_MAX[self.cells]
 
-    @property
+    @cached_property
     def grayscale_max(self) -> int:
         """The maximum of GS. A greater value is not a measurement."""
         return _GRAY_12_BIT if self.kind in {Platform.STM32, Platform.UNKNOWN} else GRAY_10_BIT
 
-    @property
+    @cached_property
     def close_s(self) -> float:
         """The expected block of `MODE00`, s. It is used until the car's readings show its own."""
         return self.block_s(ModeClose())
@@ -213,19 +213,19 @@ class Profile(Struct, frozen=True):
         """The shortest block of a `MODE00` that lost its digits, s."""
         return DIGITLESS_OPEN_S
 
-    @property
+    @cached_property
     def shortest_opening_s(self) -> float:
         """The shortest block of the opening of a mode, s."""
         return min((row.open_s for mode, row in MODES.items() if mode is not Mode.MANUAL), default=0.0)
 
-    @property
+    @cached_property
     def silent_modes(self) -> frozenset[Mode]:
         """The modes in which this car sends no readings."""
         if not self.has_readings:
             return self.modes
         return self.modes & (SILENT_MODES | _STM32_SILENT if self.kind is Platform.STM32 else SILENT_MODES)
 
-    @property
+    @cached_property
     def possible_modes(self) -> frozenset[Mode]:
         """The modes in which this car may be, whoever opened them. All modes if the platform is unknown."""
         return frozenset(Mode) if self.kind is Platform.UNKNOWN else self.modes
