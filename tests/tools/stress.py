@@ -101,8 +101,9 @@ class Pauses:
 
 
 def in_control(process: psutil.Process) -> bool:
-    """Return True if a process is a gateway or a simulator, started as a module or as a command."""
-    return any(word in ("gateway.cli", "gateway.sim") or Path(word).name == "gateway" for word in process.cmdline())
+    """Return True if a process is a gateway or a simulator, started as a module or as a command, or may become one."""
+    words = process.cmdline()  # empty while the process begins its program
+    return not words or any(word in ("gateway.cli", "gateway.sim") or Path(word).name == "gateway" for word in words)
 
 
 def of_run(run: str, spared: Iterable[int]) -> list[psutil.Process]:
