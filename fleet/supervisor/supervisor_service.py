@@ -180,7 +180,7 @@ class SupervisorService:
 
     def _parse_command(self, query: zenoh.Query, verb: str, encoding: str) -> Any:
         if verb not in SUPERVISOR_COMMANDS:
-            raise CommandRefused(f"There is no command {verb}. There are {', '.join(SUPERVISOR_COMMANDS)}.")
+            raise CommandRefused(f"There is no command {verb}: allowed are {', '.join(SUPERVISOR_COMMANDS)}.")
         if query.payload is None:
             raise CommandRefused("The payload is missing. Send a message: {} is enough.")
         return messages.parse(SUPERVISOR_COMMANDS[verb], query.payload.to_bytes(), encoding)

@@ -178,7 +178,7 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
 
 
 def test_command_that_is_none_is_refused(up: Up) -> None:
-    for verb, payload, words in (("up", "{}", "There are down, reload"), ("down", "{", "is not the JSON")):
+    for verb, payload, words in (("up", "{}", "allowed are down, reload"), ("down", "{", "is not the JSON")):
         selector = f"fleet/@supervisor/@cmd/{verb}?format=json"
         (answer,) = up.bus.query(selector, payload=payload.encode(), timeout_s=PATIENCE_S)
         assert isinstance(answer, bus.Sample)

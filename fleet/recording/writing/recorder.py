@@ -452,7 +452,7 @@ class Recorder:
                 if not self.ended.is_set():
                     self._last = self._status()
             case _:
-                raise _CommandRefused(f"There is no command {verb!r}. There are {', '.join(RecorderVerb)}.")
+                raise _CommandRefused(f"There is no command {verb}: allowed are {', '.join(RecorderVerb)}.")
 
     def _check_sender(self, query: zenoh.Query, verb: str) -> None:
         """Refuse the command if its sender may not send it. The rule is that of the plan: only leads may.
