@@ -280,7 +280,11 @@ def test_messages_without_condition_value_are_counted(
     assert "not searched: 3 of fleet/red/sensor/range: " in done.stderr
 
 
-@pytest.mark.parametrize("name", ["r; touch x #", "red\n  fleet estop --everything", "\x1b[2J", "r" * 60_000])
+@pytest.mark.parametrize(
+    "name",
+    ["r; touch x #", "red\n  fleet estop --everything", "\x1b[2J", "r" * 60_000],
+    ids=["shell", "two lines", "escape", "long"],
+)
 def test_recorded_names_become_no_command_and_no_terminal_flood(name: str, tmp_path: Path) -> None:
     made = Made(tmp_path / "a.mcap", Writer)
     made.put(f"fleet/{name}/sensor/range", pb.Range(range_m=0.1), 1)
