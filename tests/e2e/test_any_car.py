@@ -24,13 +24,18 @@ MOVES_S = 1.5
 
 @dataclass(frozen=True)
 class CarKind:
-    """One kind of car: the words of the simulator, the platform that the gateway is told, and what it can show."""
+    """One kind of car: the words of the simulator, the platform that the gateway is told, and what it can show.
+
+    `undecided`: on a busy machine, late reports may look like a block, and it stays open for some stops more. In
+    virtual time: test_timer_car_cannot_show_stop.
+    """
 
     name: str
     simulated: str
     told: str
     shows: str
     modes: bool = True
+    undecided: bool = False
 
 
 KINDS = (
@@ -38,7 +43,7 @@ KINDS = (
     CarKind("today", "arduino+interval=1.25", "arduino", "yes"),
     CarKind("slow", "arduino+interval=2.2", "arduino", "yes"),
     CarKind("text", "arduino+interval=1.25+text", "arduino", "yes"),
-    CarKind("timer", "arduino+timer+interval=1.0", "arduino", "no"),
+    CarKind("timer", "arduino+timer+interval=1.0", "arduino", "no", undecided=True),
     CarKind("stm32", "stm32", "stm32", "no"),
     CarKind("course", "course", "raspberry_pi+no_readings", "no", modes=False),
     CarKind("silent", "arduino+interval=1.25+silent=tracking", "arduino", "yes"),
@@ -135,7 +140,8 @@ def test_shows_stops_is_learned_for_each_kind_of_car(cars: KindsUnderTest) -> No
         if ended and all(found(kind) == kind.shows for kind in KINDS):
             break
     for kind in KINDS:
-        assert found(kind) == kind.shows, f"{kind.name}: {cars.fleet.state('health', kind.name)}"
+        allowed = (kind.shows, "not_known_yet") if kind.undecided else (kind.shows,)
+        assert found(kind) in allowed, f"{kind.name}: {cars.fleet.state('health', kind.name)}"
         code, outcome = outcomes[kind.name]
         assert (code, outcome["ok"]) == (0, True), str(outcome)
         assert outcome["basis"] == ("shown" if kind.shows == "yes" else "sent"), str(outcome)

@@ -7,6 +7,7 @@ from itertools import pairwise
 import pytest
 
 from gateway.control.commands import Drive, Led, SetMode, Stop
+from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 from schemas.words import Basis, CarTrust, Mode, Motion, Phase, Reason, Shows
 from tests.support.stops import ENDS_S
@@ -234,6 +235,13 @@ def test_car_deaf_from_start_cannot_show_stop() -> None:
     assert (pair.control.driver.model.motors, pair.control.driver.model.basis) == ("off", Basis.SENT)
     assert [log.code for log in pair.logs].count("cannot_show") == 1
     assert pair.ask(Drive(Motion.FORWARD, 1.0)).status is Phase.QUEUED
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_timer_car_cannot_show_stop(seed: int) -> None:
+    pair = Pair("arduino", seed=seed, traits=CarTraits(interval_s=1.0, timer=True, close_s=0.0), start_s=2.0)
+    pair.connect()
+    pair.until(lambda: pair.control.driver.model.learned.shows is Shows.NO, 30.0)
 
 
 def test_deaf_car_is_stopped_for_ever_with_growing_pauses() -> None:
