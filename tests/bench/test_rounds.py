@@ -16,7 +16,7 @@ PARTS = {"__init__", "__main__", "measured", "record_ours", "stage", "test_round
 """Modules that are not benchmarks."""
 
 
-PROCESSES = {"cli", "commands", "fleet", "floods", "load", "readings", "secure"}
+PROCESSES = {"cli", "commands", "fleet", "floods", "load", "readings", "record", "router", "secure"}
 """Benchmarks that start many processes: too much for the test suite."""
 
 
