@@ -44,7 +44,7 @@ NOT_RUN: Final = {
     r"docker .*": "needs a container engine; tests/deploy/test_containers.py checks the file",
     r"fleet exporter( --address .*)?": "stays until Ctrl-C; tests/e2e/test_exporter.py runs it",
     r"fleet foxglove( --address .*)?": "stays until Ctrl-C; tests/e2e/test_foxglove.py runs it",
-    r"(FLEET_MQTT_PASSWORD=\w+ )?fleet mqtt.*": "needs a broker; tests/soak/test_mqtt.py has one",
+    r"(FLEET_MQTT_PASSWORD=\S+ )?fleet mqtt.*": "needs a broker; tests/soak/test_mqtt.py has one",
     r"zbarcam .*": "needs a camera",
     r"fleet (hub|join|leave).*|.*--secure": "makes a hub of this computer; tests/e2e/test_secure_up.py runs it",
     r"eval .*": "is for a shell; tests/fleet/commands/test_shells.py runs it",
