@@ -1,6 +1,7 @@
 """The bus on real Zenoh sessions: hub, publications, queries, tokens, and behavior without a hub."""
 
 import asyncio
+import contextlib
 import os
 import signal
 import socket
@@ -125,24 +126,34 @@ def test_token_watch_sees_all_present_tokens(endpoint: str) -> None:
             assert all(each == there for each in answers) or cars._link.address != before
 
 
+THERE = ["fleet/red", "two/red"]
+"""Tokens of two fleets, of which a watcher watches the first."""
+
+
+@contextlib.contextmanager
+def watcher_behind(proxy: TcpProxy, endpoint: str) -> Iterator[bus.Bus]:
+    """Open a session whose link goes through a proxy. The tokens of THERE exist while it is open."""
+    with bus.Bus.open(endpoint) as cars, bus.Bus.open(f"tcp/127.0.0.1:{proxy.port}") as watcher:
+        for token in THERE:
+            cars.token(token)
+        wait_for(lambda: watcher.tokens("*/*") == THERE)
+        watcher.watch_tokens("fleet/*", lambda key, alive: None)
+        yield watcher
+    proxy.close()
+
+
 def test_tokens_after_a_lost_link(endpoint: str) -> None:
     """A session without a link got an empty answer at once, and then one without the tokens that it watched."""
-    there = ["fleet/red", "two/red"]
     proxy = StallProxy(int(endpoint.rpartition(":")[2]))
-    with bus.Bus.open(endpoint) as cars, bus.Bus.open(f"tcp/127.0.0.1:{proxy.port}") as watcher:
-        for token in there:
-            cars.token(token)
-        wait_for(lambda: watcher.tokens("*/*") == there)
-        watcher.watch_tokens("fleet/*", lambda key, alive: None)
+    with watcher_behind(proxy, endpoint) as watcher:
         proxy.cut()
         wait_for(lambda: not watcher.connected)
         proxy.mend()
         began = time.monotonic()
         while (found := watcher.tokens("*/*")) == [] and time.monotonic() > began + LINK_TIMEOUT_S:
             began = time.monotonic()  # it waited for the link: a stalled machine takes longer to open one
-        assert found == there
+        assert found == THERE
         assert watcher.tokens("fleet/*") == ["fleet/red"]
-    proxy.close()
 
 
 def listed_link(opened: bus.Bus) -> str:
@@ -151,23 +162,17 @@ def listed_link(opened: bus.Bus) -> str:
 
 def test_tokens_while_link_ends_and_next_one_opens(endpoint: str) -> None:
     """Zenoh lists a link some time before and after it carries messages. Asked then, it knew no token, or only some."""
-    there = ["fleet/red", "two/red"]
     proxy = TcpProxy(int(endpoint.rpartition(":")[2]))
-    with bus.Bus.open(endpoint) as cars, bus.Bus.open(f"tcp/127.0.0.1:{proxy.port}") as watcher:
-        for token in there:
-            cars.token(token)
-        wait_for(lambda: watcher.tokens("*/*") == there)
-        watcher.watch_tokens("fleet/*", lambda key, alive: None)
+    with watcher_behind(proxy, endpoint) as watcher:
         for _ in range(20):
             before = listed_link(watcher)
             proxy.hang_up()
             deadline = time.monotonic() + processes.PATIENCE_S
             while listed_link(watcher) in ("", before):  # without a pause, to see the next link as soon as it is listed
                 assert time.monotonic() < deadline
-            assert watcher.tokens("*/*") == there
+            assert watcher.tokens("*/*") == THERE
             proxy.hang_up()
-            assert watcher.tokens("*/*") == there
-    proxy.close()
+            assert watcher.tokens("*/*") == THERE
 
 
 def test_tokens_of_all_fleets_while_watching_one(endpoint: str) -> None:
