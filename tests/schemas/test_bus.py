@@ -127,7 +127,7 @@ def test_token_watch_sees_all_present_tokens(endpoint: str) -> None:
 
 
 THERE = ["fleet/red", "two/red"]
-"""Tokens of two fleets, of which a watcher watches the first."""
+"""Tokens of two fleets. A watcher watches those of the first one."""
 
 
 @contextlib.contextmanager
