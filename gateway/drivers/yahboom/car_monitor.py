@@ -192,10 +192,8 @@ class CarMonitor:
     @property
     def _is_idle(self) -> bool:
         """Return True if no command waits, and the car neither drives nor is in a mode."""
-        return not self._executor.queue.has_commands and self.model.trust.state not in (
-            CarTrust.DRIVING,
-            CarTrust.IN_MODE,
-        )
+        moves = self.model.trust.state in (CarTrust.DRIVING, CarTrust.IN_MODE)
+        return not moves and not self._executor.queue.has_commands
 
     def tick(self, now: float) -> None:
         """Check for silence, and for a detected platform. It is called several times a second."""
