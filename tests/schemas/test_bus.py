@@ -188,9 +188,8 @@ def test_tokens_of_all_fleets_while_watching_one(endpoint: str) -> None:
             with bus.Bus.open(endpoint) as watcher:
                 watcher.watch_tokens("fleet/*", lambda key, alive: None)
                 every, second = set(watcher.tokens("*/*")), watcher.tokens("two/*")
-            if (
-                cars._link.address == before
-            ):  # else the machine stalled for over 2 s, and the hub forgot the tokens meanwhile
+            # Otherwise the machine stalled for over 2 s, and the hub forgot the tokens meanwhile.
+            if cars._link.address == before:
                 assert every == there
                 assert second == ["two/red"]
 

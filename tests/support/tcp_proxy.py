@@ -6,6 +6,13 @@ import threading
 import time
 
 
+def _shut_down(*sockets: socket.socket) -> None:
+    """End both directions of each socket that is still open."""
+    for each in sockets:
+        with contextlib.suppress(OSError):
+            each.shutdown(socket.SHUT_RDWR)
+
+
 class TcpProxy:
     """Passes each byte on, in both directions, between clients of loopback and a target."""
 
@@ -23,16 +30,14 @@ class TcpProxy:
 
     def close(self) -> None:
         """Close the proxy, and all connections."""
-        for each in (self._listener, *self._sockets):
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
+        ended = (self._listener, *self._sockets)
+        _shut_down(*ended)
+        for each in ended:
             each.close()
 
     def hang_up(self) -> None:
         """End all connections. The next one is accepted."""
-        for each in self._sockets:
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
+        _shut_down(*self._sockets)
 
     def on_bytes(self, data: bytes, connection: int, *, from_client: bool) -> None:
         """Handle bytes before they are passed on. Connections are counted from 0."""
