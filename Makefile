@@ -41,7 +41,7 @@ demo: .venv/.ready ## three simulated cars do a job, recorded, checked, ready fo
 test: .venv/.ready ## the test suite (about six minutes on two processors)
 	@mkdir -p .tmp
 	@echo "Running the test suite: about six minutes on two processors."
-# Both once, not by each worker: the first costs each process, the second each of nine workers five seconds.
+# Both once, not by each worker: the first costs each process, the second each worker five seconds.
 	@$(BIN)/python -m compileall -q -j 0 fleet gateway schemas
 	@test -d tests/__pycache__ || $(BIN)/python -m pytest $(TESTS) -m 'not soak' --collect-only -q >/dev/null
 	$(BIN)/python -m pytest $(TESTS) -m 'not soak' -n auto --dist loadgroup

@@ -1,7 +1,14 @@
-"""Assigns tests to workers of pytest-xdist. Tests that compute have workers of their own, of low priority."""
+"""Assigns tests to workers of pytest-xdist.
+
+Tests that compute have workers of their own, in the background, with a low priority. The other tests have the
+foreground: they mostly wait for processes, cars and seconds. The background is done first, because it gets all the time
+that the foreground leaves. From then on, half of that time would be lost. So there are workers in reserve, which help
+the foreground when the background is done.
+"""
 
 import os
 from collections import Counter
+from enum import Enum, auto
 from pathlib import Path
 from typing import Final
 
@@ -17,11 +24,15 @@ SUITES: Final = "SUITES_AT_ONCE"
 """Environment variable: number of suites that share this machine (`make stress`), each with its part of the workers."""
 SUITE: Final = "SUITE_NUMBER"
 """Environment variable: index of this suite, from 0. Each suite has its part of the ports."""
+RESERVE_PER_PROCESSOR: Final = 1.5
+"""Workers in reserve per processor."""
 _PROCESSORS: Final = max(1, (os.cpu_count() or 1) // int(os.environ.get(SUITES, "1")))
-WORKERS: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS) + _PROCESSORS
+_FOREGROUND: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS)
+_RESERVE: Final = int(RESERVE_PER_PROCESSOR * _PROCESSORS)
+WORKERS: Final = _FOREGROUND + _RESERVE + _PROCESSORS
 """Number of workers. One for each processor is in the background."""
 _MIN_TESTS: Final = 1000
-"""Minimum number of tests for workers in the background."""
+"""Minimum number of tests for workers of different kinds. With fewer, all are of the foreground."""
 _LOWEST_PRIORITY: Final = 19
 _ASSIGNED_TOGETHER: Final = 8
 """Number of short tests of a file that one worker gets with one message. With a message for each test, the messages and
@@ -56,6 +67,17 @@ _STARTING: Final = ("tests/fleet/replay/analysis/test_replan.py", "tests/fleet/r
 """Files in these places that start processes. At low priority, a Rerun viewer took longer than 40 s to go on."""
 
 
+class WorkerKind(Enum):
+    """Which tests a worker runs."""
+
+    FOREGROUND = auto()
+    """All tests, first those that do not only compute."""
+    RESERVE = auto()
+    """Tests of the foreground, when the background is done."""
+    BACKGROUND = auto()
+    """Tests that only compute, with low priority."""
+
+
 def computes(nodeid: str) -> bool:
     """Return True if a test only computes."""
     return nodeid.startswith(_COMPUTING) and not nodeid.startswith(_STARTING)
@@ -74,15 +96,22 @@ def _group(item: pytest.Item) -> str:
     return str((*mark.args, *mark.kwargs.values())[0]) if mark is not None else ""
 
 
-def in_background(worker: str, workers: int, tests: int) -> bool:
-    """Return True if this worker (such as `gw7`) has low priority, and runs only tests that compute."""
-    return tests >= _MIN_TESTS and workers == WORKERS and int(worker.removeprefix("gw")) >= workers - _PROCESSORS
+def kind_of(worker: str, workers: int, tests: int) -> WorkerKind:
+    """Return the kind of a worker (such as `gw7`)."""
+    if tests < _MIN_TESTS or workers != WORKERS:
+        return WorkerKind.FOREGROUND
+    index = int(worker.removeprefix("gw"))
+    if index < _FOREGROUND:
+        return WorkerKind.FOREGROUND
+    return WorkerKind.RESERVE if index < _FOREGROUND + _RESERVE else WorkerKind.BACKGROUND
 
 
 def lower_priority(config: pytest.Config, tests: int) -> None:
     """Lower the priority of this process if it is a worker in the background."""
     given = getattr(config, "workerinput", None)
-    if given is not None and hasattr(os, "nice") and in_background(given["workerid"], given["workercount"], tests):
+    if given is None or not hasattr(os, "nice"):
+        return
+    if kind_of(given["workerid"], given["workercount"], tests) == WorkerKind.BACKGROUND:
         os.nice(_LOWEST_PRIORITY)
         if _AUTOGROUP.exists():
             os.setsid()
@@ -90,17 +119,14 @@ def lower_priority(config: pytest.Config, tests: int) -> None:
 
 
 class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has no types
-    """`--dist loadgroup` with workers in the background.
-
-    Workers in the background use the processor time that the other workers leave. All processors
-    are busy, and no simulated car is late.
-    """
+    """`--dist loadgroup` with workers in the background, and in reserve."""
 
     def __init__(self, config: pytest.Config, log: Producer) -> None:
         super().__init__(config, log)
         config.option.loadscopereorder = False  # `sort` has done it
         self._scopes: dict[str, str] = {}
         self._short: Counter[str] = Counter()
+        self._reserve_called = False
 
     def _split_scope(self, nodeid: str) -> str:
         """Return the work unit of a test."""
@@ -114,12 +140,31 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
         return self._scopes[nodeid]
 
     def _assign_work_unit(self, node: WorkerController) -> None:
-        if in_background(node.gateway.id, self.numnodes, len(self.collection or ())):
-            # tests/conftest.py has sorted the tests that compute to the end. Processes that a worker in the background
-            # started would have low priority, too. The worker takes no other tests.
-            scope, unit = next(reversed(self.workqueue.items()))
-            if not computes(next(iter(unit))):
+        # tests/conftest.py has sorted the tests that compute to the end.
+        last = next(reversed(self.workqueue))
+        background_has_tests = computes(next(iter(self.workqueue[last])))
+        kind = self._kind_of(node)
+        if kind == WorkerKind.RESERVE and background_has_tests:
+            return
+        if kind == WorkerKind.BACKGROUND:
+            if not background_has_tests:
+                # Processes that this worker started would have low priority, too. So it takes no other tests.
                 node.shutdown()
+                self._call_reserve()
                 return
-            self.workqueue.move_to_end(scope, last=False)
+            self.workqueue.move_to_end(last, last=False)
         super()._assign_work_unit(node)
+
+    def _call_reserve(self) -> None:
+        """Give the workers in reserve their first tests."""
+        if self._reserve_called:
+            return
+        self._reserve_called = True
+        for node in self.nodes:
+            if self._kind_of(node) == WorkerKind.RESERVE:
+                self._reschedule(node)
+                self._reschedule(node)  # a worker begins a test when it knows the next one
+
+    def _kind_of(self, node: WorkerController) -> WorkerKind:
+        """Return the kind of a worker."""
+        return kind_of(node.gateway.id, self.numnodes, len(self.collection or ()))
