@@ -63,6 +63,13 @@ _COMPUTING: Final = (
 """Places of tests that compute on virtual time, or read files. All other tests wait for processes, cars and seconds."""
 _LONG: Final = ("tests/fuzz/",)
 """Places of tests that take seconds. They are assigned one by one."""
+_SLOW: Final = (
+    "tests/fleet/test_demo.py",
+    "tests/gateway/link/test_ble",
+    "tests/gateway/test_slept.py",
+    "tests/gateway/tools/test_scan.py",
+)
+"""Files with tests of 10 to 40 s. They would come last, and one worker would run them after the others are done."""
 _STARTING: Final = ("tests/fleet/replay/analysis/test_replan.py", "tests/fleet/replay/rerun/test_live.py")
 """Files in these places that start processes. At low priority, a Rerun viewer took longer than 40 s to go on."""
 
@@ -84,10 +91,10 @@ def computes(nodeid: str) -> bool:
 
 
 def sort(items: list[pytest.Item]) -> None:
-    """Put tests that compute last, where workers in the background take them. Put large groups first."""
+    """Put tests that compute last, where workers in the background take them. Put large groups and slow files first."""
     groups = {item: _group(item) for item in items}
     sizes = Counter(filter(None, groups.values()))
-    items.sort(key=lambda item: (computes(item.nodeid), -sizes[groups[item]]))
+    items.sort(key=lambda item: (computes(item.nodeid), -sizes[groups[item]], not item.nodeid.startswith(_SLOW)))
 
 
 def _group(item: pytest.Item) -> str:
