@@ -46,7 +46,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Lower the priority of a worker in the background."""
-    scheduling.lower_priority(session.config, len(session.items))
+    scheduling.lower_priority(session.config, (item.nodeid for item in session.items))
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups

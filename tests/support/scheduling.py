@@ -8,6 +8,7 @@ the foreground when the background is done.
 
 import os
 from collections import Counter
+from collections.abc import Iterable
 from enum import Enum, auto
 from pathlib import Path
 from typing import Final
@@ -31,8 +32,9 @@ _FOREGROUND: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS)
 _RESERVE: Final = int(RESERVE_PER_PROCESSOR * _PROCESSORS)
 WORKERS: Final = _FOREGROUND + _RESERVE + _PROCESSORS
 """Number of workers. One for each processor is in the background."""
-_MIN_TESTS: Final = 1000
-"""Minimum number of tests for workers of different kinds. With fewer, all are of the foreground."""
+_MIN_WAITING: Final = 1000
+"""Minimum number of tests that do not only compute, for workers of different kinds. With fewer, all workers are of the
+foreground: beside workers that compute, those in the background would get no time."""
 _LOWEST_PRIORITY: Final = 19
 _ASSIGNED_TOGETHER: Final = 8
 """Number of short tests of a file that one worker gets with one message. With a message for each test, the messages and
@@ -103,9 +105,9 @@ def _group(item: pytest.Item) -> str:
     return str((*mark.args, *mark.kwargs.values())[0]) if mark is not None else ""
 
 
-def kind_of(worker: str, workers: int, tests: int) -> WorkerKind:
-    """Return the kind of a worker (such as `gw7`)."""
-    if tests < _MIN_TESTS or workers != WORKERS:
+def kind_of(worker: str, workers: int, tests: Iterable[str]) -> WorkerKind:
+    """Return the kind of a worker (such as `gw7`) in a run of tests with these ids."""
+    if sum(not computes(each) for each in tests) < _MIN_WAITING or workers != WORKERS:
         return WorkerKind.FOREGROUND
     index = int(worker.removeprefix("gw"))
     if index < _FOREGROUND:
@@ -113,7 +115,7 @@ def kind_of(worker: str, workers: int, tests: int) -> WorkerKind:
     return WorkerKind.RESERVE if index < _FOREGROUND + _RESERVE else WorkerKind.BACKGROUND
 
 
-def lower_priority(config: pytest.Config, tests: int) -> None:
+def lower_priority(config: pytest.Config, tests: Iterable[str]) -> None:
     """Lower the priority of this process if it is a worker in the background."""
     given = getattr(config, "workerinput", None)
     if given is None or not hasattr(os, "nice"):
@@ -133,6 +135,7 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
         config.option.loadscopereorder = False  # `sort` has done it
         self._scopes: dict[str, str] = {}
         self._short: Counter[str] = Counter()
+        self._kinds: dict[str, WorkerKind] = {}
         self._reserve_called = False
 
     def _split_scope(self, nodeid: str) -> str:
@@ -174,4 +177,7 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
 
     def _kind_of(self, node: WorkerController) -> WorkerKind:
         """Return the kind of a worker."""
-        return kind_of(node.gateway.id, self.numnodes, len(self.collection or ()))
+        worker = node.gateway.id
+        if worker not in self._kinds:
+            self._kinds[worker] = kind_of(worker, self.numnodes, self.collection or ())
+        return self._kinds[worker]
