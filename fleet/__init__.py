@@ -4,7 +4,8 @@
 A `Catalog` answers questions about all recordings.
 """
 
-# `fleet` handles Ctrl-C only after this module is imported, and `typing` would take longer than all the rest.
+# Do not import this name from `typing`, which would take longer than all the rest of this module. The `fleet` command
+# handles Ctrl-C only after this module is imported.
 from __future__ import annotations
 
 from importlib import import_module

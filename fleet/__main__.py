@@ -1,6 +1,6 @@
 """The `fleet` command as a script and as `python -m fleet`.
 
-Ctrl-C prints no traceback, even while it starts or ends.
+Ctrl-C prints no traceback, even while the command starts or ends.
 """
 
 from schemas.process import startup

@@ -163,7 +163,10 @@ class Fleet:
     async def resume(
         self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False
     ) -> list[Outcome]:
-        """End the e-stops with these ids. Without ids, end the hold. If `cars` is None, do so for every car."""
+        """End the e-stops with these ids. Without ids, end the hold that a stop left.
+
+        If `cars` is None, do so for every car.
+        """
         return await self.ask(resume_request(ids, everything=everything), cars)
 
     async def pause(self, why: str = "") -> list[Outcome]:
@@ -217,7 +220,7 @@ class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
 
 
 class Lease:
-    """The lease of a car, from `Car.lease`. Use it with `async with`. Raises LeaseLost if another has the car."""
+    """The lease of a car, from `Car.lease`. Use it with `async with`. Raises LeaseLost if another client has it."""
 
     def __init__(self, fleet: Fleet, name: str, *, take: bool) -> None:
         self._fleet = fleet

@@ -20,7 +20,7 @@ from schemas.suggestion import how_to_install, misspelled
 
 
 def _plain_commands(section: str) -> dict[str, tuple[str, str]]:
-    """Return the subcommands under a heading that a row of `schemas.commands` describes."""
+    """Return those subcommands of one heading that have a row in `schemas.commands`."""
     rows = [row for row in commands.COMMANDS.values() if row.section == section]
     return {row.subcommand: (f"fleet.commands.actuators:{row.subcommand}", row.summary) for row in rows}
 

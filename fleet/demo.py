@@ -408,7 +408,7 @@ def _process(run: Demo, name: str, module: str, *arguments: str) -> "Iterator[su
 def _started(stack: ExitStack, process: "AbstractContextManager[subprocess.Popen[str]]") -> "subprocess.Popen[str]":
     """Start a process that the stack ends.
 
-    Delay signals meanwhile, because a signal could leave the process running.
+    Delay signals until the stack has the process: an earlier signal could leave the process running.
     """
     with signals.held_back():
         return stack.enter_context(process)

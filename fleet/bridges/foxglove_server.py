@@ -50,7 +50,7 @@ _LAST_TIMEOUT_S: Final = 3.0
 """Timeout for the last message of a topic that is published only on change. If nobody can answer, the query ends at
 once."""
 
-# The SDK logs an error for each message to a client that has gone without closing its connection.
+# Do not print the SDK's log. It has an error for each message to a client that has gone without closing its connection.
 _sdk_log = logging.getLogger("foxglove")
 _sdk_log.propagate = False
 _sdk_log.addHandler(logging.NullHandler())

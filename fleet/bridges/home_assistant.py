@@ -1,19 +1,19 @@
 """Decides which MQTT messages about a fleet Home Assistant gets, and when. Pure: time is an argument.
 
-Each car is a device with a few entities. One retained message announces the car (device discovery, Home Assistant
-2024.11 and later). Then there are two topics for each car: `state`, one JSON object with a value for each entity, and
-`availability`.
+Each car is a device with a few entities. One retained message, which the broker keeps for later clients, announces the
+car (device discovery, Home Assistant 2024.11 and later). Then there are two topics for each car: `state`, one JSON
+object with a value for each entity, and `availability`.
 
 **A number is never older than it looks.** A value that was not measured, or is stale, is null, which Home Assistant
 shows as unknown. States are not retained: a client that connects gets the next state, at most REPEAT_S later, and never
 yesterday's. An entity expires after EXPIRE_S without a state, so a bridge that hangs leaves no old value on the screen.
 Availability is retained, because Home Assistant reads it when it starts. It is `offline` for a car whose gateway has
-gone or is silent, or whose link is lost. The bridge has an availability of its own, which its last will sets to
-`offline`. An entity is available only if the car and the bridge are.
+gone or is silent, or whose link is lost. The bridge has an availability of its own, which the broker sets to `offline`
+if the bridge's connection breaks (the bridge's last will). An entity is available only if the car and the bridge are.
 
 **After a crash,** the broker still has what the bridge had retained: the announcements, and `online` for its cars. The
-next bridge reads these messages when it begins (`adopt`), and publishes `offline` for cars that are not there. A bridge
-that ends normally removes them all, so Home Assistant forgets the devices.
+next bridge reads these messages when it begins (`adopt`), and publishes `offline` for cars that are not on the bus. A
+bridge that ends normally removes them all, so Home Assistant forgets the devices.
 """
 
 import json
@@ -65,7 +65,7 @@ class Entity(Struct, frozen=True):
     config: Mapping[str, Any]
     """The entity's settings for Home Assistant. In a template, {0} stands for `name`."""
     of_absent: bool = False
-    """True if it has a value even if the car is not available."""
+    """True if the entity has a value even while the car is not available."""
 
     def component(self, car_id: str) -> dict[str, Any]:
         """Return the part of a car's announcement that describes this entity, without its availability."""

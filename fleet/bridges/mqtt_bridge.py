@@ -33,8 +33,8 @@ _TOPICS: Final = ("state/*", "sensor/battery", "sensor/range")
 _BROKER_TIMEOUT_S: Final = 5.0
 """Timeout of each exchange with the broker. After it, the connection is opened again."""
 _KEEPALIVE_S: Final = 10
-"""After this silence, the bridge sends the broker a ping. The broker publishes the last will after one and a half times
-this silence."""
+"""After this silence, the bridge sends the broker a ping. After one and a half times this silence, the broker publishes
+the bridge's last will: that the bridge is offline."""
 _FAREWELL_TIMEOUT_S: Final = 1.0
 """Timeout for the broker's first answer when the bridge ends."""
 _END_TIMEOUT_S: Final = 5.0

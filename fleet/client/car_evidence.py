@@ -25,7 +25,7 @@ _EVENT = topics.TOPICS["event/command"]
 
 
 def collect(client: Fleet) -> dict[str, CarEvidence]:
-    """Return the evidence by car, for every car that is on the bus, supervised, or served on this computer."""
+    """Return the evidence by car, for every car that is on the bus, supervised, or has a gateway on this computer."""
     present = client.cars()
     here = running_cars_of(client.bus.endpoint, client.name)
     supervisions = ask_status(client.bus, client.name)
@@ -51,7 +51,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     coordinated = bool(client.bus.tokens(keys.car_token(client.name, keys.COORDINATOR)))
     return {
         car: CarEvidence(
-            # The stamps are by the gateway's clock, so the ages must be, too.
+            # The stamps are by the gateway's clock, so compute the ages by that clock, too.
             CarState.of_answers(car, answers.get(car, []), now + clocks.get(car, 0.0), present=car in present),
             now + clocks.get(car, 0.0),
             clock_off_s=clocks.get(car),
@@ -80,8 +80,8 @@ def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
 def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]:
     """Return how far the clock of each car's gateway is off, s. Cars whose clock is right are left out.
 
-    newest_s: by car, the newest stamp in its answers. If a stamp is odd, listen to the states of that car for at most
-    _CLOCK_LISTEN_S.
+    newest_s: by car, the newest stamp in its answers. If a stamp is off by more than MAX_CLOCK_OFF_S, listen to the
+    states of that car for at most _CLOCK_LISTEN_S.
     """
     now_s = time.time()
     odd = {car for car, at_s in newest_s.items() if abs(at_s - now_s) > MAX_CLOCK_OFF_S}

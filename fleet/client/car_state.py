@@ -1,7 +1,7 @@
 """A car as the bus shows it: the newest message of each topic, the age of each message, and conclusions from them.
 
 Pure: time is an argument (s, of any one clock). Lists, status, doctor, console and the plan all look at a car through
-one `CarState`, so that they agree. `claims` puts it into words.
+one `CarState`, so that they agree. The module `claims` puts that state into words.
 
 **How old is a message?** Its age could count from its arrival, by our clock, or from its stamp, by the gateway's clock.
 The clocks of two computers differ by seconds. By stamps, a car that publishes once a second could look stale.
@@ -13,9 +13,9 @@ stamp is far ahead of our clock, a clock was set back after the message was stam
 since a person wants to know them, but `current` does not return them. They are forgotten as soon as another gateway of
 the car publishes a state. A late state of the earlier gateway does not bring them back (`GatewayStarts`).
 
-**Is the car ready, silent, unheard?** Each is a property or a method here. A car can be ready before it has shown that
-it stops, because a command does not wait for that. A car that nobody has heard yet, or whose gateway publishes nothing
-any more, is not ready.
+**Is the car ready, silent, unheard?** Each of these words has a property or a method here. A car can be ready before it
+has shown that it stops, because a command does not wait for that. A car that nobody has heard yet, or whose gateway
+publishes nothing any more, is not ready.
 """
 
 from collections.abc import Iterable
@@ -48,7 +48,7 @@ class GatewayStarts:
     """Recognizes the messages of the running gateway of a car.
 
     Each start of a gateway has a `boot_id`. A message of an earlier start may come late, through a cache or a slow
-    reader. It must not bring back what that gateway claimed. Two gateways of a car may run for a moment, until one of
+    reader, and must not bring back what that gateway claimed. Two gateways of a car may run for a moment, until one of
     them ends. So a message that is stamped clearly later than all others counts, whichever start it is from.
     """
 
@@ -107,7 +107,7 @@ class CarState(Struct):
     def take(self, topic: str, message: Any, at: float) -> bool:
         """Add a message of a topic such as `state/link`. `at` is the time from which its age counts.
 
-        Return False if it does not count: it is older than the newest one, or its gateway has ended.
+        Return False if the message does not count: it is older than the newest one, or its gateway has ended.
         """
         before = self.newest_by_topic.get(topic)
         if before is not None and before.at > at:
@@ -117,7 +117,7 @@ class CarState(Struct):
                 if message.boot_id == self._boot_id:  # the last words of a gateway that has just ended
                     self.newest_by_topic[topic] = Observation(message, at)
                 return False
-            boot_id = message.boot_id or self._boot_id  # a message without one counts as the same gateway's
+            boot_id = message.boot_id or self._boot_id  # a message without a boot_id counts as the same gateway's
             if self._boot_id not in ("", boot_id):
                 self._forget_states()
             self._boot_id = boot_id
@@ -128,7 +128,7 @@ class CarState(Struct):
         return True
 
     def on_presence(self, *, present: bool) -> None:
-        """Note whether the car's gateway is on the bus. When it comes back, it publishes its states again."""
+        """Note whether the car's gateway is on the bus. A gateway that comes back publishes its states again."""
         if present and not self.present:
             self._forget_states()
         self.present = present
@@ -257,7 +257,8 @@ class CarState(Struct):
             return "silent: is it switched on?"
         if safety.waits_for:
             return f"waits for {safety.waits_for}"
-        # Some cars never send a byte. So `off` and `on` count without one, but not the other states of the motors.
+        # Some cars never send a byte. So the motors' states `off` and `on` count before any byte has come. Their other
+        # states do not.
         heard = safety.motors in (Motors.OFF, Motors.ON) or (safety.motors and self.last_rx_s is not None)
         return None if heard else NEVER_HEARD
 

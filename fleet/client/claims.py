@@ -33,7 +33,8 @@ class CarClaim(Struct, frozen=True):
     what: str
     """The claim, such as `off`, `tracking` or `online`. `unknown` if nobody knows."""
     basis: str = ""
-    """Motors: `shown`, `sent`. Mode: `confirmed`, `assumed`, `contradicted`. Empty if there is none."""
+    """Motors: `shown` (by the car's readings) or `sent` (only the frames speak for it). Mode: the gateway's verdict,
+    `confirmed`, `assumed` or `contradicted`. Empty if there is none."""
     since_s: float | None = None
     """How long it has been so. None if that is not known."""
     age_s: float | None = None
@@ -166,7 +167,10 @@ def claims_of(
 
 
 def describe_end_of_doubt(car: str) -> str:
-    """Return a text that says how to end the doubt about a car. No plan uses the car until then."""
+    """Return a text that says how to end the doubt about a car that did not show its stop.
+
+    No plan uses the car until then.
+    """
     return (
         f"`fleet stop {car}` ends the doubt if the car then shows its stop, `fleet resume {car}` if a person has "
         "looked at the car."

@@ -63,7 +63,7 @@ _NO_TIMEOUT_POLL_S: Final = 3600.0
 """Poll interval of a wait without a timeout."""
 _MAX_STOP_THREADS: Final = 1024
 """Maximum number of threads for the queries of stops. Each query waits on its own thread. A stop of all cars makes two
-queries."""
+queries: to the gateways and to the supervisor."""
 _MIN_QUERY_TIMEOUT_S: Final = 0.1
 """Minimum timeout of the query for the current values, even if the wait itself is shorter."""
 
@@ -263,7 +263,7 @@ class Fleet:
         return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until the condition `when` is true for a reading, and return it. The current reading may be the one.
+        """Wait until the condition `when` is true for a reading, and return it. The current reading counts, too.
 
         With `for_s`, the condition must have been true in all readings of this time, by their stamps. Without
         `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
@@ -333,10 +333,10 @@ class Fleet:
         return self.ask(estop_request(why, Scope.FLEET if cars is None else Scope.CAR), cars)
 
     def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
-        """End the e-stops with these ids. Without ids, end the hold. If `cars` is None, do this for every car.
+        """End the e-stops with these ids. Without ids, end the hold that a stop left.
 
-        With `everything`, end the hold and every e-stop that this sender may end. If an e-stop or a hold remains, the
-        outcome is not ok.
+        If `cars` is None, do this for every car. With `everything`, end the hold and every e-stop that this sender may
+        end. If an e-stop or a hold remains, the outcome is not ok.
         """
         return self.ask(resume_request(ids, everything=everything), cars)
 

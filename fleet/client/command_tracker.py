@@ -19,10 +19,11 @@ ANSWER_TIMEOUT_S: Final = 2.0
 WAIT_SAID_S: Final = 1.0
 """Time after which the user is told that a command waits for a busy car."""
 SEND_AGAIN_INTERVAL_S: Final = 0.5
-"""Interval at which a stop without an answer is sent again. A lost session tries to connect again at least as often."""
+"""Interval at which a stop without an answer is sent again. A Zenoh session that has lost its hub tries to connect
+again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
-"""Interval at which a stop without an answer checks whether the bus is there. A lost session stays lost for at least
-twice as long."""
+"""Interval at which a stop without an answer checks whether the bus is there. A Zenoh session that has lost its hub
+stays without one for at least twice as long."""
 _MAX_QUEUED_ITEMS: Final = 4096
 """Maximum number of unread answers and events of a command. Each of up to some hundred cars sends a few."""
 
@@ -49,7 +50,7 @@ class PresenceChange:
 class SupervisedCars:
     """The cars whose gateways a supervisor runs, and the cars that were on the bus when it answered.
 
-    Without a supervisor, there are no such gateways.
+    Without a supervisor, `names` is empty.
     """
 
     def __init__(self, names: frozenset[str], present: frozenset[str]) -> None:
@@ -68,10 +69,10 @@ class PendingCommand:
 
     # A stop must not miss a car whose gateway hangs: after 2 s its token is gone, and a wildcard query no longer
     # reaches it. Therefore a stop is also for the cars that a supervisor knows, and is sent again to their new
-    # gateways. A stop could also be lost with the bus: a hub that hangs accepts the query, and drops it when Zenoh's
-    # lease ends and cuts its links. So a stop that a gateway has not answered is sent again when the bus is back, as
-    # long as gateways accept a stop of that age (STOP_TTL_S). A car that has answered does not get the stop again,
-    # because a person may have released the car meanwhile.
+    # gateways. A stop could also be lost with the bus: a hub that hangs accepts the query, and drops it when Zenoh
+    # takes the hub for dead (after its lease, 2 s) and cuts the hub's links. So a stop that a gateway has not answered
+    # is sent again when the bus is back, as long as gateways accept a stop of that age (STOP_TTL_S). A car that has
+    # answered does not get the stop again, because a person may have released the car meanwhile.
 
     def __init__(
         self,

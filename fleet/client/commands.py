@@ -137,7 +137,7 @@ def lease_request(*, take: bool = False, release: bool = False) -> CommandReques
 
 
 def stop_request() -> CommandRequest:
-    """Request a stop and a hold against the coordinator."""
+    """Request a stop and a hold: no plan moves the car until somebody drives or resumes it."""
     return CommandRequest(Verb.STOP, pb.StopCommand(), Until.STOPPED)
 
 
@@ -147,7 +147,7 @@ def estop_request(why: str, scope: str) -> CommandRequest:
 
 
 def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
-    """Request the end of the e-stops with these ids. Without ids, request the end of the hold.
+    """Request the end of the e-stops with these ids. Without ids, request the end of the hold that a stop left.
 
     With `everything`, request the end of the hold and of all e-stops.
     """
@@ -242,7 +242,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(estop_request(why, Scope.CAR))
 
     def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:
-        """End the e-stops with these ids. Without ids, end the hold.
+        """End the e-stops with these ids. Without ids, end the hold that a stop left.
 
         With `everything`, end the hold and every e-stop that this sender may end.
         """

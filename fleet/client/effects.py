@@ -8,7 +8,7 @@ from schemas.words import Basis, Phase, Reason
 
 _ANY: Final = "*"
 UNCONFIRMED: Final = "unconfirmed"
-"""The result of a stop or a drive whose basis is `sent`."""
+"""The result of a stop or a drive whose basis is `sent`: the frames were sent, and no reading shows their effect."""
 RELEASE: Final = "release"
 ESTOP_FLEET: Final = "estop_fleet"
 """Verbs that exist only in this module: for a drive with motion stop, and for an e-stop of all cars."""

@@ -42,7 +42,7 @@ class JobThreads:
     def shutdown(self, *, wait: bool = True, cancel_futures: bool = False) -> None:
         """Accept no new job. With `cancel_futures`, drop the jobs that wait for a thread.
 
-        With `wait`, wait until the others end.
+        With `wait`, wait until all other jobs end.
         """
         with self._lock:
             self._closed = True

@@ -1,7 +1,7 @@
 """The lease of a car, `with fleet.car("red").lease() as car`. The end of the block stops the car.
 
 A car whose lease was lost is not stopped, because it has another holder.
-`Lease` acquires, renews and releases it. `LeaseMonitor` detects its loss from the gateway's messages (pure).
+`Lease` acquires, renews and releases the lease. `LeaseMonitor` detects its loss from the gateway's messages (pure).
 """
 
 import threading
@@ -70,7 +70,7 @@ class LeaseMonitor:
         self._hold = hold
 
     def _denial(self, authority: Authority) -> Denial | None:
-        """Return why a pause, a loan or the people of the fleet keep us from the car."""
+        """Return why a pause, a loan or the rank of our person keeps us from the car."""
         # A hold may be older than our lease, and then it has not ended the lease.
         return replace(authority, hold=None).may(authority.people.ranked(self._sender), Right.ACT)
 
@@ -104,7 +104,7 @@ class LeasingFleet(Protocol):
 
 
 class Lease(Generic[C_co]):
-    """The lease of a car, which `Car.lease` returns. Use it with `with`. Raises LeaseLost if another has the car."""
+    """The lease of a car, which `Car.lease` returns. Use it with `with`. Raises LeaseLost if another client has it."""
 
     def __init__(self, fleet: LeasingFleet, name: str, leased: "Callable[[Lease[C_co]], C_co]", *, take: bool) -> None:
         """`leased` makes the car that the block gets."""

@@ -20,7 +20,7 @@ _STILL_STOPPED: Final = (Reason.ESTOPPED, Reason.HELD)
 _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 OUTCOME_MARGIN_S: Final = 5.0
-"""Margin of the timeouts for a command's last event."""
+"""Time that is added to the longest time after which a command's last event is due."""
 GATEWAY_RETURN_TIMEOUT_S: Final = 1.0
 """Timeout for a gateway to rejoin the bus. A gateway tries to do so twice a second."""
 GATEWAY_RESTART_TIMEOUT_S: Final = 15.0
@@ -210,7 +210,7 @@ class Progress:
         self._note(phase, reason, words, at)
 
     def on_missing(self, present: Sequence[str], at: float) -> None:
-        """Give up: the car has no token."""
+        """Give up, because the car's gateway is not on the bus (it has no token)."""
         there = f"Connected: {', '.join(present)}." if present else "No car is connected."
         words = f'No car named "{self.car}". {" ".join(filter(None, (did_you_mean(self.car, present), there)))}'
         if self._verb in STOP_VERBS:

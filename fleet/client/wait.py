@@ -27,7 +27,7 @@ class _LastReading(Struct):
 
     at: datetime
     arrived_s: float | None
-    """When the reading was published, s, monotonic. None if a query returned it."""
+    """When the reading arrived after its publication, s, monotonic. None if a query returned it."""
     message: str
     """The message's type. Messages of another type have other fields."""
     holding: Holding | None
@@ -48,8 +48,8 @@ class ConditionWait:
     def ends(self, reading: Reading, now: datetime, arrived_s: float | None = None) -> bool:
         """Return True if this reading ends the wait. Stale readings and readings out of order do not.
 
-        arrived_s: when it was published, s, monotonic; None if a query returned it. The time for which the condition
-        must hold begins again after a step of the wall clock or a sleep of the computer.
+        arrived_s: when it arrived after its publication, s, monotonic; None if a query returned it. The time for which
+        the condition must hold begins again after a step of the wall clock or a sleep of the computer.
         """
         before = self._seen.get(reading.key)
         if before is not None and _is_other_clock(reading, before, arrived_s):

@@ -23,7 +23,7 @@ from fleet.recording.tools.verify import verify
 from schemas.suggestion import did_you_mean
 
 MAX_STOP_LINES: Final = 20
-"""Maximum number of unshown stops that are printed, one per line. --json lists all."""
+"""Maximum number of stops that cars did not show, as printed, one per line. --json lists all."""
 MAX_FURTHER_FINDINGS: Final = 3
 """Maximum number of findings on the line after the likely cause."""
 

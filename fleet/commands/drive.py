@@ -225,7 +225,7 @@ def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
 
 
 def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
-    """Return the cars, or None for all. One query then reaches all at once, also cars that have just connected."""
+    """Return the cars, or None for all. With None, one query reaches all cars, also those that joined just now."""
     return resolve_cars(client, cars) if cars and ALL_CARS not in cars else None
 
 

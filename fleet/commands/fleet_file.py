@@ -31,7 +31,7 @@ from schemas.yaml_document.fault_words import list_words
 SCHEMAS: Final = ("fleet", "plan", "world")
 DEFAULT_FILE: Final = Path("fleet.yaml")
 DEFAULT_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "violet", "orange", "teal", "brown")
-"""Default names, in the order of the palette."""
+"""Default names, in the order of the default colors."""
 _SKIP: Final = "-"
 _OTHER_FILE: Final = "name another file with --out"
 _TAKE_ALL: Final = "`fleet init --yes` takes every likely car without a question"

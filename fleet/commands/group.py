@@ -116,7 +116,7 @@ def say(words: str, *, err: bool = False, fleet: str = "") -> None:
 
 
 def starter_option() -> _Decorator:
-    """Return the hidden option of `schemas.process.parent.parent_option`."""
+    """Return the hidden option --parent, which a starting process adds with `schemas.process.parent.parent_option`."""
     words = "End when this process ends: it started this one."
     return click.option("--parent", "starter", metavar="PID", type=int, hidden=True, help=words)
 

@@ -32,7 +32,8 @@ FLEET_DOWN_TIMEOUT_S: Final = 120.0
 SUPERVISOR_LOST_S: Final = 10.0
 """Time without a status and without a token after which the supervisor counts as ended.
 
-On a machine that stalls, Zenoh ends a session after 2 s. Its tokens are then gone until the session is open again.
+On a machine that stalls, Zenoh cuts a process off after 2 s. The tokens of the process are gone until it is connected
+again.
 """
 FLEET_DOWN_POLL_S: Final = 0.2
 LOG_POLL_S: Final = 0.2

@@ -100,7 +100,7 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
 def _no_plan(client: Fleet) -> str:
     """Return a text that says that no plan is running, and names the command that starts one.
 
-    It names `fleet up` only if that does not run.
+    It names `fleet up` only if no supervisor runs.
     """
     is_up = bool(client.bus.tokens(keys.car_token(client.name, keys.SUPERVISOR)))
     other = "" if is_up else ", or a fleet with one: `fleet up --plan FILE`"

@@ -61,7 +61,7 @@ def replay(
             try:
                 _export(found, out, part, cars)
             except NoSession:
-                must_say_damage = False  # this error says it
+                must_say_damage = False  # this error names the damage
                 raise
             finally:  # only an export finds all damage
                 if found.damage and must_say_damage:

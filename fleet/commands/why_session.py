@@ -31,7 +31,7 @@ MAX_TIMELINE_LINES: Final = 60
 
 
 def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
-    """Print why a stop of this car was not shown then, and what happened before and after."""
+    """Print why this car did not show a stop at that time, and what happened before and after."""
     try:
         session = Session(path)
     except NoSession as error:
