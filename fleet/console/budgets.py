@@ -13,8 +13,8 @@ from msgspec import Struct, field
 
 from schemas.token_bucket import TokenBucket
 
-# Our page sends 10 echoes a second while a finger is down, and a few messages for each press. After 30 s of slow Wi-Fi
-# it may send some 450 at once. The limits are ten times that.
+# Our page sends 10 echoes a second (answers to ticks, see `hold_to_drive`) while a finger is down, and a few messages
+# for each press. After 30 s of slow Wi-Fi it may send some 450 at once. The limits are ten times that.
 PAGE_BURST: Final = 5000.0
 PAGE_RATE: Final = 160.0
 """Messages of one page: at once, and per second."""
@@ -36,14 +36,15 @@ COOLDOWN_S: Final = 15.0
 # asks.
 COMMAND_BURST: Final = 200.0
 COMMAND_RATE: Final = 20.0
-"""Commands of a device that ask gateways, at once and per second. A press counts once, even if it turns."""
+"""Commands of a device that ask gateways, at once and per second. A press counts once, even if its direction
+changes."""
 MAX_OPEN_COMMANDS: Final = 16
 """Maximum number of commands of one device that have no outcome yet. One command may be for many cars."""
 MAX_BUDGETS: Final = 1024
 """Maximum number of remembered persons, devices and strangers. Beyond it, the one that was idle the longest is
 forgotten."""
 MERGE_S: Final = 0.1
-"""Time within which further STOPs of one person are merged into one. This one follows at the end of the time."""
+"""Time within which further STOPs of one person are merged into one, which is sent at the end of that time."""
 TOO_MUCH: Final = "This page has sent far more than a person can. STOP still works; it connects again in 15 s."
 
 TOO_MANY_PLANS: Final = "Too many plans of this person wait for a check. Try again in a few seconds."

@@ -48,7 +48,7 @@ class CommandLedger:
         words = event.phase + (f": {event.words or event.reason}" if event.words or event.reason else "")
         if event.HasField("took_s"):
             words += f" after {event.took_s:.2f} s"
-        if not command.decided or command.decided[-1] != words:  # a stream repeats its events
+        if not command.decided or command.decided[-1] != words:  # a stream of drives repeats its events
             command.decided = [*command.decided, words][-MAX_WIRE_FRAMES:]
         if event.evidence or event.basis:
             command.evidence = "; ".join(filter(None, (event.basis, *event.evidence)))

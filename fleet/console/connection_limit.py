@@ -1,7 +1,7 @@
 """How many connections from the network the console keeps. Pure: time is an argument (s, monotonic).
 
-A connection is counted here from the moment when it begins TLS, which `waiting_room` decides. Strangers must not use up
-the file descriptors and the time of the process that stops the cars.
+A connection is counted here from the moment when it begins TLS. `waiting_room` decides when that is. Strangers must not
+use up the file descriptors and the time of the process that stops the cars.
 """
 
 from collections.abc import Hashable

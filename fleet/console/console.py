@@ -1,4 +1,7 @@
-"""The console's state: pages, presses, and the views of the cars. It wires the pure parts to the bus and the pages."""
+"""The console's state: pages, presses, and the views of the cars. It wires the pure parts to the bus and the pages.
+
+A press is a motion that a person holds down at a page.
+"""
 
 import asyncio
 import json
@@ -67,7 +70,7 @@ _MAX_EVENTS: Final = 4096
 _MAX_MERGES: Final = 256
 """Maximum number of remembered merges of stops, by sender and verb."""
 _MAX_STOP_IDS: Final = 256
-"""Number of remembered STOP presses. Each press arrives twice: over the socket and by fetch."""
+"""Number of remembered ids of STOPs. Each STOP arrives twice: over the socket and by fetch."""
 
 GUEST_MESSAGES: Final = frozenset(
     {"echo", "ping", Verb.STOP, "plot", "lanes", "lanes_end", "map", "map_end", "inspect", "inspect_end"}
@@ -346,7 +349,7 @@ class Console:
         return self.operator if person is None else self._operators.of(person.name)
 
     def sender_of(self, person: PagePerson | None) -> str:
-        """Return the name under which a request acts, also of a person without an open page."""
+        """Return the name under which a request of this person acts, even if the person has no open page."""
         sender = self.operator_of(person).sender
         return sender if person is None or person_of(sender) == person.name else default_sender(person.name)
 

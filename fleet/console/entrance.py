@@ -35,8 +35,9 @@ HANDSHAKE_TIMEOUT_S: Final = 3.0
 SHUTDOWN_TIMEOUT_S: Final = 2.0
 """Timeout for the client's end of TLS. It is the same as for the end of the WebSocket, which comes before
 (`fair_socket`)."""
-# The objects of a connection refer to each other, and have some 90 kB of buffers. The collector looks at old objects
-# only after some 80,000 new ones. That may take an hour: after a flood, 64 MB stayed. A collection takes 1 to 3 ms.
+# The objects of a connection refer to each other, and have some 90 kB of buffers. Python's garbage collector looks at
+# old objects only after some 80,000 new ones. That may take an hour: after a flood, 64 MB stayed. A collection takes 1
+# to 3 ms.
 COLLECT_AFTER: Final = 100
 """Number of handshakes after which their garbage is collected: 9 MB at most."""
 _READ_BYTES: Final = 4096

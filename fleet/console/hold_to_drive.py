@@ -1,6 +1,7 @@
 """Hold to drive: the dead man's switch of the pages. Pure: time is an argument (s, monotonic).
 
-The server numbers its ticks. While the finger is down, the page echoes each tick with the id of its press.
+The server sends each page numbered ticks, ten a second. While the finger is down, the page echoes each tick with the id
+of its press.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,7 @@
-"""Feeds the time line, and the bands of the plots, with what the cars have done since the console started."""
+"""Feeds the time line, and the bands of the plots, with what the cars have done since the console started.
+
+A lane is one row of the time line.
+"""
 
 import json
 import time

@@ -1,6 +1,6 @@
 """Feeds the map with the places of the cars, five times a second.
 
-While no page shows the map, only the trails are kept.
+While no page shows the map, only the trails (the recent paths of the cars) are kept.
 """
 
 import json

@@ -19,7 +19,7 @@ POSE: Final = TOPICS["sensor/pose"]
 WORLD: Final = TOPICS["@sim/world"]
 PLACE_TOPICS: Final = (TRUTH.name, POSE.name)
 TRAIL_S: Final = 30.0
-"""Length of a trail, live and at a moment of a recording."""
+"""Length of a trail (the recent path of a car), live and at a moment of a recording."""
 TRAIL_STEP_S: Final = 0.25
 """Minimum time between two points of a trail."""
 TRAIL_STEP_M: Final = 0.01

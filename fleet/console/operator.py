@@ -1,4 +1,4 @@
-"""Sends the commands of the pages of one person: the stream of a held press, STOP, and single commands."""
+"""Sends the commands of the pages of one person: the stream of drives of a held press, STOP, and single commands."""
 
 import asyncio
 import logging
@@ -97,7 +97,7 @@ class ConsoleOperator:
             bus.put_command(key, payload, encoding, sequence)
 
     async def _ask_first_drive(self, press: HeldPress, on_refusal: Callable[[Outcome], object]) -> None:
-        # A gateway reports only the first rejection of a stream. It always answers a query.
+        # A gateway reports only the first rejection of a stream, but it always answers a query.
         outcomes = await self._fleet.ask(drive_request(press.motion, DRIVE_TTL_S, wait=False), press.cars)
         for outcome in outcomes:
             if not outcome.ok and outcome.reason != Reason.SUPERSEDED:

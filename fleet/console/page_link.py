@@ -1,4 +1,4 @@
-"""The messages to one page. Answers wait in a bounded queue. Only the newest tick and the newest state wait.
+"""The messages to one page. Answers wait in a bounded queue. Of ticks and of states, only the newest waits.
 
 A page that does not read does not delay any other page.
 """
@@ -67,8 +67,8 @@ class PageLink:
             await self._not_empty.wait()
             self._not_empty.clear()
             while self._newest or self._answers:
-                # Send the tick first, because its echo keeps a car driving. Only the greeting, which is the first
-                # answer, precedes it.
+                # Send the tick first, because the page's answer to it (the echo) keeps a car driving. Only the
+                # greeting, which is the first answer, precedes it.
                 kind = "tick" if "tick" in self._newest else next(iter(self._newest), "")
                 answers = bool(self._answers) and (kind != "tick" or not greeted)
                 text = self._answers.popleft() if answers else self._newest.pop(kind)

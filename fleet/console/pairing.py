@@ -283,7 +283,7 @@ class PeopleBook(Struct, frozen=True):
 
 
 class GuessLimit(Struct):
-    """Counts wrong codes, and makes the addresses that they come from wait. Times are monotonic."""
+    """Counts wrong codes, and delays further tries from the addresses that sent them. Times are monotonic."""
 
     wrong: int = 0
     """Number of all wrong codes."""

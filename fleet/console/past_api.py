@@ -24,11 +24,11 @@ from fleet.console.worker import TooManyQuestions, Worker
 from schemas.keys import is_name
 
 LANES_TIMEOUT_S: Final = 120.0
-"""Timeout of the lanes of a recording. An hour of twenty cars takes 3 s, as does a day of three cars. Both take ten
-times as long with the lowest share of a processor."""
+"""Timeout of the lanes of a recording. An hour of twenty cars takes 3 s, as does a day of three cars. On a busy
+processor both take ten times as long, because the processes have a low priority."""
 MOMENT_TIMEOUT_S: Final = 20.0
-"""Timeout of a moment. It takes 0.2 s with twenty cars, and ten times as long with the lowest share of a processor. The
-start of the process takes up to 10 s."""
+"""Timeout of a moment. It takes 0.2 s with twenty cars, and ten times as long on a busy processor. The start of the
+process takes up to 10 s."""
 IDLE_READER_S: Final = 300.0
 """Time without a question after which the processes end. A person may look at the result of a jump for minutes."""
 MAX_OPEN_LOOKS: Final = 2

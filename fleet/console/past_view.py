@@ -71,7 +71,7 @@ def map_at(known: Iterable[Known], trail: Iterable[Known], at_ns: int) -> dict[s
 
 
 def plan_at(in_force: Iterable[Known], decisions: Iterable[Known]) -> dict[str, Any]:
-    """Return what the plan page shows of a moment: the last plan by then, who had which role, and late decisions.
+    """Return what the plan page shows of a moment: the last plan by then, who had which role, and the last decisions.
 
     A recording does not show whether the coordinator was still running.
     """

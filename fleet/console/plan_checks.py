@@ -20,8 +20,8 @@ from schemas.bus import Sample
 from schemas.yaml_document.document import BadFile
 
 PLAN_CHECK_TIMEOUT_S: Final = 30.0
-"""Timeout of a check. The worst plan of 60 kB takes 2 s, or 20 s with the lowest share of a busy processor. The process
-needs another 1 s to start, or 10 s on a busy machine, like a coordinator."""
+"""Timeout of a check. The worst plan of 60 kB takes 2 s, or 20 s on a busy processor, because the process has a low
+priority. The process needs another 1 s to start, or 10 s on a busy machine, like a coordinator."""
 IDLE_CHECKER_S: Final = 60.0
 """Time after the last check at which the process ends. A person who writes a plan checks it from time to time."""
 

@@ -31,7 +31,7 @@ class PlanFeed(PageFeed):
     """The plan in force, and who may change it. file: the fleet file. operator: the console's own operator.
 
     sender_of: returns the name under which a person acts. refusal: returns why a person may not manage plans. newest:
-    the newest messages of the cars, each with its age (s).
+    returns the newest messages of the cars, each with its age (s).
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class PlanFeed(PageFeed):
 
     @property
     def messages(self) -> Mapping[str, Handler]:
-        """Ask the coordinator: next phase, restart, stop."""
+        """The message that asks the coordinator for the next phase, a restart or a stop."""
         return {"plan": self._ask}
 
     def _ask(self, page: PageLink, message: PageMessage) -> None:

@@ -45,7 +45,7 @@ class PlotFeed(PageFeed):
 
     @property
     def messages(self) -> Mapping[str, Handler]:
-        """Plot some series."""
+        """The message that plots some series on a page."""
         return {"plot": self._begin}
 
     def _begin(self, page: PageLink, message: PageMessage) -> None:

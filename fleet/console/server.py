@@ -54,8 +54,8 @@ _MAX_STOP_ID_LENGTH: Final = 64
 _PLAN_MESSAGE_ROOM: Final = 1024
 """Bytes that a message may have besides the text of a plan."""
 _LAST_READ_MESSAGES: Final = 10_000
-"""When a page has exceeded its budget, up to this number of its messages are searched for stops. One read, 256 KiB, has
-8,000 of the smallest messages."""
+"""When a page has exceeded its budget, up to this number of its messages are searched for stops. One read, 256 KiB,
+holds 8,000 of the smallest messages."""
 _LAST_READ_S: Final = 2.0
 """Timeout of this search. It takes 0.4 s, or several times as long if other pages flood the console, too."""
 NORMAL: Final = 1000

@@ -17,7 +17,8 @@ class NotInFolder(Exception):
 def session_path(place: Path, name: str) -> Path:
     """Return the path of the session of this name. Raises NotInFolder.
 
-    The name must be that of an entry of the folder: no other path can be formed with it. A link may lead elsewhere.
+    The name must be that of an entry of the folder: no other path can be formed with it. A link is refused, because it
+    may lead elsewhere.
     """
     entries = {each.name: each for each in place.iterdir()} if place.is_dir() else {}
     path = entries.get(name)
@@ -27,7 +28,7 @@ def session_path(place: Path, name: str) -> Path:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the files of a session, without links and the recorder's reserve."""
+    """Return the files of a session, without links and the recorder's spare file, which only reserves disk space."""
     if path.is_file():
         return [path]
     names = sorted(each for each in path.iterdir() if each.is_file() and not each.is_symlink())

@@ -38,7 +38,7 @@ class SessionJobs:
             kill(process)
 
     async def run_for(self, request: Request, *arguments: str) -> tuple[int, str, str]:
-        """Run `fleet` for a person, as `run` does. End it if the client of the request has gone."""
+        """Run `fleet` for a person, as `run` does. End the process if the client of the request has gone."""
         person = request.scope.get(PERSON)
         name = person and person.name
         if self._counts[name] >= MAX_JOBS_OF_PERSON:

@@ -21,7 +21,10 @@ _UNDER_WAY: Final = (Phase.ASKED, Motors.STOPPING)
 
 
 class StopReport:
-    """One STOP of the console. A car is `shown` only when its own readings show that it stands."""
+    """One STOP of the console.
+
+    A car is `shown` only when its own readings show that it stands, and `sent` if no reading can.
+    """
 
     def __init__(self, number: int, verb: str, sender: str, cars: Iterable[str], now: float, at_ms: int) -> None:
         self.number = number
@@ -118,7 +121,10 @@ class StopReport:
         }
 
     def _began_since(self, safety: Any, stamp_ns: int, now: float) -> bool:
-        """Return True if this claim about the motors began after this STOP. An older one is not a result of it."""
+        """Return True if this claim about the motors began after this STOP.
+
+        An older claim is not a result of this STOP.
+        """
         if not safety.HasField("trust_since_s"):
             return False
         # Check both clocks: a bus that hung delivers old states, and the clock of another computer may be ahead.

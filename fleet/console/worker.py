@@ -81,7 +81,8 @@ class Worker:
 
     async def _answer(self, line: bytes) -> dict[str, Any] | None:
         """Return the answer of the process, or None if the process has died."""
-        # Somebody must wait for this answer, or it would be taken for the answer to the next question.
+        # Keep the process only after its answer was read. An answer that nobody read would be taken for that to the
+        # next question.
         process, self._process = self._process or await self._start(), None
         answered = False
         try:
