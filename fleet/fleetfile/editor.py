@@ -1,7 +1,7 @@
 """Writes a link into the text of a fleet file. Everything else, including comments, stays as it is. Pure.
 
-The editor inserts the link into the text at YAML's marks, and never writes the whole YAML again. It parses the result,
-and refuses it if anything except the link has changed.
+The editor inserts the link into the text, at the position that the YAML parser gives, and never writes the whole YAML
+again. It parses the result, and refuses it if anything except the link has changed.
 """
 
 from pathlib import Path

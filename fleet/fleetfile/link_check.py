@@ -1,4 +1,4 @@
-"""Checks the links in a fleet file without opening any that could move, reset or end a car.
+"""Checks the links in a fleet file. Opens only those whose opening cannot move or reset a car, or end its program.
 
 Opening a serial port resets an Arduino. Closing a connection to a Raspberry Pi car ends the car's program while the
 motors keep running (docs/reference/protocol.md#hazards-of-raspberry-pi-programs), so only its host is checked. For a

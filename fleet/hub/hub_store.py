@@ -53,7 +53,7 @@ class KnownIdentity(Struct):
     until: str
     """When its certificate expires, ISO 8601, UTC."""
     generation: int = 1
-    """Number of common names that the identity has had. It is part of the common name unless it is 1."""
+    """Number of common names that the identity has had. The number is part of the common name unless it is 1."""
     revoked: bool = False
     local: bool = False
     """True if its key is on this computer."""
@@ -255,7 +255,7 @@ class HubStore(Struct):
         self.known[identity] = entry
 
     def _next(self, identity: str, now: datetime) -> KnownIdentity:
-        """Return the entry for a new certificate. It makes an earlier certificate of this identity invalid."""
+        """Return the entry for a new certificate, which makes an earlier certificate of this identity invalid."""
         before = self.known.get(identity)
         return KnownIdentity(_until(now), 1 if before is None else before.generation + 1)
 

@@ -69,7 +69,7 @@ def is_hub_here(endpoint: str) -> bool:
 
 
 def is_authority_here(ca: bytes) -> bool:
-    """Return True if this computer has the key of the authority with this certificate. It then is the hub."""
+    """Return True if this computer has the key of the authority with this certificate. Then it is the hub."""
     found = directory_of(SECURE_ENDPOINT).parent.glob(f"*/{DIRECTORY}/{CA_FILE}")
     return any(each.read_bytes() == ca and HubStore(Credentials(each.parent, "")).is_hub for each in found)
 
@@ -82,7 +82,7 @@ def use(endpoint: str) -> None:
 
 
 def check_storage(host: str, port: int = 0) -> None:
-    """Raise NotJoined if this computer cannot store what it gets when it joins, before a code is used up.
+    """Raise NotJoined if this computer cannot store what it gets when it joins. Call this before a code is used up.
 
     host: the host of the hub that this computer will use. Empty if it must be found first. port: the port of that hub,
     if it is known.

@@ -21,7 +21,7 @@ from schemas.words import LinkState, Reason, Verdict
 REFUSED_MODE_RETRY_S: Final = 10.0
 """Delay before the next request of a mode that a car refused."""
 _REFUSALS: Final = frozenset({Reason.BATTERY_LOW, Reason.UNSUPPORTED, Reason.LINK_DOWN, Reason.WRITE_FAILED})
-"""Reasons that lie with the car itself. Holds and leases are known from its states."""
+"""Reasons that lie with the car itself. Holds and leases are not among them, because the car's states show them."""
 _STAND_IN: Final = "/"
 """Suffix of a role's name. It marks the places of the role that stand in for another role."""
 _ROLE_LOSS_COST: Final = 1_000_000_000
@@ -172,7 +172,10 @@ def follow_needs(
 
 
 def allocate(candidates: Candidates) -> RoleAllocation:
-    """Give the roles in force to cars. For each car that a role lacks, the role's fallback gets one more place."""
+    """Give the roles in force to cars.
+
+    For each car that a role lacks, the role's fallback (`if_none`) gets one more place.
+    """
     plan, cars = candidates.plan, (*candidates.free, *candidates.reserved)
     counts = {
         name: _count_places(candidates, plan.roles[name], len(cars))

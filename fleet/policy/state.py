@@ -32,6 +32,7 @@ class ModeAttempts(Struct, frozen=True):
     count: int = 0
     again_at: float = 0.0
     fine_since: float | None = None
+    """Time since which the car has been in the mode. None if it is not."""
 
     def after(self, now: float) -> "ModeAttempts":
         """Return the attempts after one more command."""
@@ -92,7 +93,9 @@ class PolicyState(Struct, frozen=True):
     held_roles: Mapping[str, HeldRole] = field(default_factory=dict)
     """The role of each car. A car that cannot be commanded keeps its role for a moment."""
     gone_since: Mapping[str, float] = field(default_factory=dict)
+    """By car: the time since which the plan may not or cannot command it."""
     needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
+    """By car and role: True if the car meets the role's needs."""
     mode_attempts: Mapping[str, ModeAttempts] = field(default_factory=dict)
     led_requests: frozenset[LedRequest] = frozenset()
     blinks: Mapping[str, BlinkState] = field(default_factory=dict)

@@ -43,7 +43,7 @@ def can_be_true(expression: Expression, profile: CarProfile, mode: Mode) -> bool
 
 
 def _assume(node: Node, names: frozenset[str], *, value: bool) -> Node:
-    """Copy a tree. A part that uses one of these names becomes the literal that pulls the result towards this value."""
+    """Copy a tree. A part that uses one of these names becomes the literal `value`, or its opposite under a `not`."""
     match node:
         case Not(inner):
             return Not(_assume(inner, names, value=not value))
