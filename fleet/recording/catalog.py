@@ -2,8 +2,8 @@
 
 `sensor_range` has the messages of `sensor/range` of every car in every session, with the columns of
 `fleet sessions export` and the name of the `session`. `sensor_range_context` adds what was true at that time: the mode
-as commanded and as seen, the motion, who drove, and the phase of the plan. The columns `owner` and `driver` that it
-adds are persons. `sender` and other columns are as recorded: `person_of(sender)` is the person. Topics without a
+as commanded and as seen, the motion, who drove, and the phase of the plan. The columns `owner` and `driver` of the
+context are persons. `sender` and other columns are as recorded: `person_of(sender)` is the person. Topics without a
 message have views, too.
 
 A view is defined only when a question names it, because DuckDB then opens its files: a thousand sessions have twenty

@@ -61,8 +61,8 @@ def _any_fleet(topic: str) -> str:
 def matches(expression: str, key: str) -> bool:
     """Return True if a key equals or matches a key expression of the bus.
 
-    `*` matches one chunk, `**` any number of chunks, `$*` any part of a chunk. None of them matches a chunk that begins
-    with @.
+    `*` matches one chunk (the text between two slashes), `**` any number of chunks, `$*` any part of a chunk. None of
+    them matches a chunk that begins with @.
     """
     return expression == key or ("*" in expression and _pattern(expression).fullmatch(f"{key}/") is not None)
 

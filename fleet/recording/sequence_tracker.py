@@ -52,7 +52,8 @@ def _fill(gaps: list[Gap], number: int) -> bool:
 class SequenceTracker:
     """Tracks the live and backfilled messages of one key. Numbers count from 1, modulo 2^32.
 
-    Call `add_live` only if the number does not follow `last` of its sender.
+    Call `add_live` only if the number does not follow `last` of its sender. For a consecutive number, the caller sets
+    `last` itself.
     """
 
     __slots__ = ("_early", "_first", "_gaps", "_lost", "last")
@@ -165,8 +166,8 @@ class PublisherSequence(Struct):
     """Tracks the recorded messages of one publisher on one key."""
 
     restarts: bool = False
-    """True if the count may restart. A number that neither grows nor fills a gap is then a restart. If False, it is a
-    duplicate.
+    """True if the count may restart. A number that neither grows nor fills a gap is then a restart. If False, such
+    a number is a duplicate.
 
     The `seq` of a payload never restarts within one `boot_id`. Zenoh's number begins again with each new publisher.
     """

@@ -1,4 +1,4 @@
-"""The status of one car from its messages, and the changes that deserve a line. Pure: time is an argument."""
+"""The status of one car from its messages, and the changes that are reported in a line. Pure: time is an argument."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ RATE_WINDOW_S: Final = 2.0
 
 @dataclass(slots=True)
 class CarStatus:
-    """The state of one car for the supervisor, and which of its changes deserve a line."""
+    """The state of one car for the supervisor, and which of its changes are reported in a line."""
 
     car: str
     state: CarState = field(init=False)

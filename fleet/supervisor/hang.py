@@ -1,6 +1,7 @@
 """Distinguishes a hung process from a slow one, and from a stalled hub or machine. Pure.
 
-The supervisor kills a process that sends no heartbeat for its `Patience`, unless there is another explanation:
+The supervisor kills a process that sends no heartbeat for its `Patience` (`spec` has the values), unless there is
+another explanation:
 - The supervisor itself stalled (`WatchClock`) and could not receive heartbeats.
 - Many processes are silent at once (`have_common_cause`), because the hub or the machine stalls.
 - The process is only slow (`Pulse`). A hung process uses no CPU time, or a whole CPU.

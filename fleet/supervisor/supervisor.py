@@ -73,7 +73,7 @@ _LOGGED_ELSEWHERE: Final = ("log", "decision", "simulator")
 
 
 class SupervisorEvent(Struct, frozen=True):
-    """An event that deserves a line. what: `process`, `car`, `hold`, `log`, `decision`, READY, MISSING, ..."""
+    """An event that is reported in a line. what: `process`, `car`, `hold`, `log`, `decision`, READY, MISSING, ..."""
 
     what: str
     name: str

@@ -126,7 +126,7 @@ class RecordScanner:
             return False
         if opcode == Opcode.CHUNK:
             return length > MAX_RECORD_BYTES or self._begins(end) or self._is_intact(at)
-        # If the length of the entries of an index agrees, trust it even if a damaged record follows.
+        # If the length of the entries of an index agrees, trust the record even if a damaged one follows.
         if opcode == Opcode.MESSAGE_INDEX:
             body = read(self._file, at + HEAD.size, _MESSAGE_INDEX_HEAD.size)
             return (

@@ -132,7 +132,7 @@ def data_frame(table: "pa.Table") -> "pd.DataFrame":
 def join_as_of(left: "pa.Table", right: "pa.Table", prefix: str, tolerance_s: float | None) -> "pa.Table":
     """Add to each row of `left` the fields of the latest row of `right` of the same car, at most `tolerance_s` older.
 
-    Both are sorted by publish_time. tolerance_s: None for the time after which the topic of `right` is stale.
+    Both tables are sorted by publish_time. tolerance_s: None for the time after which the topic of `right` is stale.
     """
     if tolerance_s is None:
         topic = topics.of_key(right["key"][0].as_py()) if right.num_rows else None

@@ -1,4 +1,7 @@
-"""Lists what happened to one car around one time of a session: commands, records, claims and decisions. Pure."""
+"""Lists what happened to one car around one time of a session: commands, log records, claims of its gateway, decisions.
+
+Pure.
+"""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -72,7 +75,7 @@ class CarTimeline(Struct):
         return [each for each in self.stops.stops if self.begin_ns <= each.at_ns < self.end_ns]
 
     def as_dict(self) -> Mapping[str, Any]:
-        """Return it as JSON values."""
+        """Return the timeline as JSON values."""
         return {
             "car": self.car,
             "begin_ns": self.begin_ns,

@@ -60,7 +60,7 @@ class LaneSpan(Struct):
     bad: bool = False
 
     def as_list(self) -> list[Any]:
-        """Return it as JSON values, with times in ms."""
+        """Return the span as JSON values, with times in ms."""
         return [self.car, self.lane, self.begin_ns // 1_000_000, self.end_ns // 1_000_000, self.words, self.bad]
 
 
@@ -119,7 +119,10 @@ class Lanes(Struct):
             yield from (span for span in spans if span.end_ns >= at_ns)
 
     def silences(self, now_ns: int) -> Iterator[LaneSpan]:
-        """Yield a loss for each car that has been silent for too long by now. It may never be heard again."""
+        """Yield a loss for each car that has been silent for too long by now.
+
+        No later message may come to end the loss.
+        """
         for car, heard_ns in sorted(self._heard_ns.items()):
             if now_ns - heard_ns > HELD_NS:
                 yield LaneSpan(car, Lane.LOSS, heard_ns, now_ns, NOT_HEARD, bad=True)

@@ -47,7 +47,7 @@ class UnshownStop(Struct):
         return f"{self.car} at {clock(self.at_ns / 1e9)}: {asked} {what}: {self.words}{cause}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the stop as JSON values."""
         return {
             "car": self.car,
             "at": clock(self.at_ns / 1e9),

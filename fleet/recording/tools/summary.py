@@ -175,7 +175,7 @@ class _Span:
 
 
 def growth_check(session: Session) -> Callable[[], bool]:
-    """Return a function that returns whether an unclosed session has grown since. It waits up to MAX_GROWTH_WAIT_S."""
+    """Return a function that tells if an unclosed session has grown since now. It waits up to MAX_GROWTH_WAIT_S."""
     began, before = time.monotonic(), _size(session.segments)
 
     def has_grown() -> bool:

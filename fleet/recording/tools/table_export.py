@@ -139,7 +139,7 @@ class _Export:
         """Write every message."""
         by_channel = self._by_channel
         for info, sequence, log_ns, publish_ns, payload in rows:
-            # Look it up by identity, which is fast. Storing the object too keeps its id from being reused.
+            # Look the channel up by identity, which is fast. Storing the object, too, keeps its id from being reused.
             known = by_channel.get(id(info))
             if known is None:
                 message_class = self._decoder.class_of(info)

@@ -3,8 +3,8 @@
 Every table begins with the same columns. `car` comes from the key, so the field `car` of a message is left out. A field
 with a unit has it in its name (`rx_bytes`, `uptime_s`), as in `fleet get --csv`. Values that were not measured are
 None.
-The request of a command has a column for each field (`request_motion`). It is None if the request was for another
-command.
+The request of a command has a column for each field (`request_motion`). Such a column is None if the request has no
+such field.
 """
 
 import json

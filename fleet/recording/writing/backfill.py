@@ -43,7 +43,8 @@ GAP_MARGIN_S: Final = 2.0
 """Margin of a window for two delays of the network: that of the last message before the gap, and that of the query. A
 publisher counts the window back from the arrival of the query."""
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
-"""Number of polls that cover Zenoh's 2 s lease. Counted in polls because a stalled process does not poll."""
+"""Number of polls in 2 s, after which Zenoh takes a silent hub for dead (its lease). Counted in polls, because a
+stalled process does not poll."""
 MAX_SINGLE_KEYS: Final = 16
 """Maximum number of keys to query one by one. If there are more, query everything."""
 MAX_ANSWERS: Final = 200_000
@@ -65,7 +66,9 @@ class Backfill:
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
         self._due = [now + after for after in ((0.0,) if resumes else ()) + QUERY_AFTER_START_S]
+        """When the planned queries are due, s, monotonic."""
         self._missing_since = now - (RESUME_WINDOW_S if resumes else 0.0)
+        """Time from which messages may be missing, s, monotonic."""
         self._query_all = True
         self._keys: set[str] = set()
 
@@ -81,7 +84,7 @@ class Backfill:
     def request(self, keys: Mapping[str, float]) -> None:
         """Request a backfill of these keys. Values: age of the last message before the gap, s.
 
-        The gap may be long: while a car is cut off, its gateway keeps publishing, and others hear it only after that.
+        The gap may be long: while a car is cut off, its gateway keeps publishing, and others hear it only afterwards.
         """
         now = time.monotonic()
         with self._lock:

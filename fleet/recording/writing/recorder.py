@@ -390,7 +390,7 @@ class Recorder:
             self._session.messages,
         )
         self._last.drops.update(self._session.drops)
-        with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report it
+        with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report the failure
             self._service.publish(self._last, self._now())
 
     @property

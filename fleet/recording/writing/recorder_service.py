@@ -37,7 +37,7 @@ def speaks_for_fleet(site: str, others: Iterable[str]) -> bool:
 
 
 class RecorderService:
-    """The declarations of a recorder in a bus session. `site` is the other site where it runs, or empty."""
+    """The declarations of a recorder on the bus. `site` is the other site where it runs, or empty."""
 
     def __init__(self, bus: Bus, fleet: str, site: str = "") -> None:
         self._bus = bus
@@ -74,7 +74,7 @@ class RecorderService:
     def open(self, on_query: Callable[[zenoh.Query, str], object]) -> None:
         """Answer queries from now on. on_query: called with each query for this recorder, as by `Bus.queryable`.
 
-        It is also called with the key of the answer, because a query may have wildcards.
+        It also gets the key of the answer, because a query may have wildcards.
         """
 
         def for_fleet(query: zenoh.Query) -> object:

@@ -1,8 +1,8 @@
 """Writes one MCAP file: channels, schemas and messages. session_writer.py assigns messages to files. No threads.
 
 The writer of the mcap package cannot be used after an error, because its index then has chunks that the file lacks. So
-it writes into memory, and only `flush` and `finish` write to the disk. If the disk is full, the data stays in memory
-for the next try.
+that writer writes into memory here, and only `flush` and `finish` write to the disk. If the disk is full, the data
+stays in memory for the next try.
 """
 
 import contextlib

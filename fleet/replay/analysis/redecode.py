@@ -29,8 +29,8 @@ MAX_PLATFORM_DELAY_NS: Final = 1_500_000_000
 MAX_FRAME_WAIT_NS: Final = 2_500_000_000
 """How long a frame is kept until the next state has certainly come: states are published once a second."""
 _MAX_ECHO_LEAD_NS: Final = 300_000_000
-"""An echo may have an earlier stamp than the frame that it repeats, because a frame is published after it was written.
-This is the maximum difference."""
+"""An echo (a frame of ours that comes back) may have an earlier stamp than the frame that it repeats, because a frame
+is published after it was written. This is the maximum difference."""
 
 Outcome = tuple[str, dict[str, dict[str, Any]]]
 """Verdict, and fields of each reading by topic."""

@@ -86,7 +86,7 @@ class Player:
 
     def _alive(self) -> list[str]:
         """Return the tokens of live processes that publish what we would replay."""
-        # `*` matches no chunk that begins with @, so services are queried one by one.
+        # `*` matches no part of a key that begins with @, so services are queried one by one.
         services = (keys.SUPERVISOR,) if self.cars_only else (keys.SUPERVISOR, keys.COORDINATOR, keys.RECORDER)
         of_services = (token for each in services for token in self.bus.tokens(f"{self.name}/{each}/**"))
         return [*self.bus.tokens(f"{self.name}/*"), *of_services]
