@@ -15,7 +15,7 @@ import { Component, html, Icon, Refused, render, useEffect, useRef, useState, Ve
 const SHOW_REPORT_MS = 30_000;
 const SAME_PRESS_MS = 1000;
 
-// Only who opens these pages loads them: uPlot is three times as large as all else.
+// These pages are loaded only when somebody opens them: uPlot (for the plots) is three times as large as all else.
 const loadPlots = async () => {
   const looks = document.createElement("link");
   Object.assign(looks, { rel: "stylesheet", href: "/static/vendor/uplot.css" });
@@ -100,7 +100,7 @@ window.addEventListener(
   { capture: true },
 );
 
-// After a click with the mouse no button has the focus, so that Space stops. By keyboard the focus stays where it is.
+// After a click with the mouse no button has the focus, so that Space stops. After a press by keyboard the focus stays.
 window.addEventListener("click", (event) => {
   const focus = document.activeElement;
   if (event.pointerType === "mouse" && focus?.matches("button, summary, a, input[type=checkbox]")) focus.blur();
@@ -120,7 +120,7 @@ const stopDetail = (car) =>
   car.at_ms === null ? "" : t.stopDetail(car.state, clock(car.at_ms), car.took_s, clock(car.moved_at_ms ?? car.at_ms));
 
 const SAID_TWICE = /^NOT CONFIRMED: /;
-// Folded, a failed car is its name beside the line that says how many failed.
+// In a folded report, a failed car is only its name beside the line that says how many failed.
 const Stopped = ({ car, isShort }) => html`<li class=${`chip stop-${car.state}`} data-stop=${car.name} title=${car.words}>
   ${isShort
     ? html`<span class="bad"><span aria-hidden="true">${stopStates.failed[0]}</span> ${car.name}<span class="unseen"> ${stopStates.failed[1]}</span></span>`
@@ -128,8 +128,8 @@ const Stopped = ({ car, isShort }) => html`<li class=${`chip stop-${car.state}`}
         ${car.state === "failed" ? ` ${car.words.replace(SAID_TWICE, "")}` : ""}`}
 </li>`;
 
-// The content ends above the report that lies over it: whatever its height, the last button can be scrolled into view.
-// Only the content gets the height: on the root it would make a slow phone style the whole page again.
+// The report lies over the content. So the content gets the report's height as padding: its last button can be scrolled
+// into view. Only the content has this property: on the root it would make a slow phone style the whole page again.
 const cover = (height) => document.getElementById("content")?.style.setProperty("--covered", height);
 const covered = new ResizeObserver(([{ target }]) => cover(`${target.offsetHeight}px`));
 function noteReport(report) {
@@ -138,7 +138,7 @@ function noteReport(report) {
   if (report !== null) covered.observe(report);
 }
 
-// One line, so that it covers no pad. Which cars failed is never folded away.
+// The report of the newest STOP. Folded, it is one line that covers no pad. The failed cars are always named.
 let reportSeen = [0, 0];
 function Report({ report }) {
   const [unfolded, setUnfolded] = useState(0); // the number of the report that is shown car by car
@@ -169,7 +169,7 @@ function StopBar() {
     setWhy("");
   };
   const toggle = (what) => setAsking(asking === what ? null : what);
-  // A pause is for leads. Until the rights are known its place stays empty: STOP must not become smaller under a finger.
+  // A pause is for leads. Until the rights are known, its button's place is empty: STOP must not shrink under a finger.
   const mayPause = store.rights === null || store.rights.pause === "";
   const onWhyKey = (event) => event.key === "Enter" && !event.repeat && !event.isComposing && act();
   return html`<section class="stopbar" aria-label="STOP">
@@ -242,7 +242,7 @@ function Connection() {
   return html`<span class=${`connection ${kind === "live" ? "" : "bad"}`} data-connection=${kind}><span aria-hidden="true">${symbol}</span> ${words}</span>`;
 }
 
-// On every page while somebody looks back, with the way to now.
+// Shown on every page while somebody looks back, with the way back to now.
 function PastBar() {
   const { past } = store;
   if (past === null) return null;

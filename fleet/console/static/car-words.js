@@ -10,10 +10,10 @@ export const motorName = (car) => {
 
 export const isMoving = (car) => car.motors.state === "on";
 
-// Its gateway has gone, or has no link to it: nothing is known of it now, and nothing stops it.
+// The car's gateway has gone, or has no link to the car: nothing is known of the car now, and nothing stops it.
 export const isLost = (car) => !car.gateway || car.link.state === "lost";
 
-// Somebody has stopped it, and nothing shows yet that it stands.
+// Somebody has stopped the car, and nothing shows yet that it stands.
 export const isUnconfirmed = (car) => !isLost(car) && (car.hold !== null || car.estops.length > 0) && !["off", "stopping"].includes(car.motors.state);
 
 // How long nothing new has come of a car, s. 0 while news come.
@@ -45,7 +45,7 @@ function findTroubles(car) {
     .map(([level, name, since_s]) => ({ level, name, short: t.troubles[name], words: since_s ? t.troubleFor(t.troubles[name], t.ago(since_s)) : t.troubles[name] }));
 }
 
-// The direction for the eye, and the words for all.
+// The motion of a car: the direction for an arrow, and words for people who cannot see the arrow.
 export const directionOf = (car) => (isMoving(car) ? (car.motion.motion in arrows ? car.motion.motion : "some") : "none");
 export const motionWords = (car) =>
   isMoving(car) ? (arrows[car.motion.motion]?.[1] ?? t.isMoving) : (tileMotors[motorName(car)] ?? tileMotors.unknown)[1];
@@ -55,7 +55,7 @@ export const modeWords = (word) => modes[word]?.[0] ?? word;
 // The person who drives a car now, or has taken it. Empty if nobody has.
 export const driverOf = (car) => (isMoving(car) && car.motion.owner) || car.lease?.holder || "";
 
-// The person who has a car, and how. Nobody knows this of a lost car.
+// The person who has a car, and how. Of a lost or unconfirmed car, the words about its motion instead.
 export function holderOf(car) {
   const driver = driverOf(car);
   if (isLost(car) || isUnconfirmed(car)) return motionWords(car);

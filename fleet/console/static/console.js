@@ -18,7 +18,7 @@ const MAX_DRAWING_MS = 150; // the longest time that counts, so that the page re
 const STOPS = ["stop", "estop"]; // also while somebody looks back
 const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
 
-// A page that is loaded again, as phones do with one that slept, has the same cars selected. Another tab has its own.
+// A page that is loaded again (phones do that with a page that slept) has the same cars selected. Each tab has its own.
 const SELECTED = "fleet-selected";
 function remembered() {
   try {
@@ -76,7 +76,7 @@ export function changed() {
     drawing = false;
     const began = performance.now();
     for (const listener of listeners) listener();
-    // After the frame: on a slow phone its layout and paint take longest.
+    // Measure after the frame: on a slow phone its layout and paint take longest.
     setTimeout(() => {
       const now = performance.now();
       freeAt = now + DRAWING_SHARE * Math.min(now - began, MAX_DRAWING_MS);
@@ -126,7 +126,7 @@ export const when = ({ at_ms, zone_s }, letters = 5) =>
 
 const newId = () => Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 
-// Twice at once: the socket may be half dead, and a fetch with keepalive outlives the page. The console acts once.
+// Send STOP in two ways: the socket may be half dead, and a fetch with keepalive outlives the page. The console acts once.
 export function stopAll() {
   const id = newId();
   send({ t: "stop", id });
@@ -153,7 +153,7 @@ async function postStop(id, until) {
 }
 
 export function estopAll(why) {
-  if (!store.connected || store.lost) stopAll(); // by fetch, again and again; an e-stop has only the socket
+  if (!store.connected || store.lost) stopAll(); // a stop also goes by fetch, again and again
   send({ t: "estop", id: newId(), why });
   letGo();
   changed();
@@ -161,7 +161,7 @@ export function estopAll(why) {
 
 // ---------------------------------------------------------------- who may do what
 
-// A person without host and process, even if it is this person in another program; a sender without a person as it is.
+// The person of a sender, without host and process. A sender without a person stays as it is.
 const personOf = (sender) => seen(sender.split("@")[0] || sender);
 export const who = (sender) => (sender === store.hello?.sender ? describe.you : personOf(sender));
 
@@ -210,7 +210,7 @@ export function carSets(cars) {
     .filter((set) => set.key === "all" || set.cars.length > 0);
 }
 
-// Both are there before anything is drawn: with the rights it is known whose cars come first.
+// Nothing is drawn before all three are there: the rights say whose cars come first.
 export const isReady = () => store.hello !== null && store.state !== null && store.rights !== null;
 
 // The cars in the order of their places.
@@ -298,7 +298,7 @@ export function lease(kind, cars) {
   send({ t: kind, id: requestNumber, cars });
 }
 
-// What a page shows beside the cars: it registers what it does with a message of the console, by its `t`. The page is
+// What pages show beside the cars: a page registers a handler for messages of the console with this `t`. The page is
 // drawn again afterwards, unless the handler returns false.
 const handlers = new Map();
 export function on(kind, handler) {
@@ -310,7 +310,7 @@ export function askBySocket(kind, fields) {
   return requestNumber;
 }
 
-// What a page wants from now on, also of a console that was started again. `end` is sent when it wants nothing more.
+// What a page wants from now on, also of a console that was started again. `end` is sent when the wish ends.
 const wishes = new Map();
 export function wish(message) {
   wishes.set(message.t, message);
@@ -400,7 +400,7 @@ export function onTick(listener) {
 }
 
 async function connect() {
-  // A console that was started again has another cookie.
+  // A console that was started again needs another cookie, which this request brings.
   try {
     const hello = await fetch("/hello");
     const why = hello.ok ? "" : seen((await hello.text()).slice(0, MAX_WHY));

@@ -29,7 +29,7 @@ function onKeyDown(event) {
   if (!event.repeat) press(motion, names(), `key ${event.code}`);
 }
 
-// By its place: with another key held down, the same key may have another letter.
+// Keys are told apart by their places (`code`): with another key held down, the same key may have another letter.
 const onKeyUp = (event) => release(`key ${event.code}`);
 
 function stickMotion() {
@@ -48,7 +48,7 @@ let stickBefore = null;
 function onStick() {
   const motion = stickMotion();
   if (motion === stickBefore) return;
-  // Its drive has ended: only a stick that was let go begins another one.
+  // The stick's drive has ended: a person must let go of the stick before it begins another one.
   if (motion !== null && stickBefore !== null && !isHeld("stick")) return;
   stickBefore = motion;
   if (motion === null) release("stick");
@@ -72,9 +72,9 @@ function useDriving() {
 // ---------------------------------------------------------------- the delay
 
 const PING_INTERVAL_MS = 1000;
-// The console ends a press whose echo is older than 300 ms. Half of that is a connection on which a drive soon ends.
+// The console ends a drive if the page's echoes of its ticks are older than 300 ms. Half of that is a warning.
 const LONG_DELAY_MS = 150;
-let ping = null; // the one without an answer: {id, at}
+let ping = null; // the ping that has no answer yet: {id, at}
 let delay_ms = null;
 on("pong", (message) => {
   if (message.id !== ping?.id) return false;
@@ -99,7 +99,7 @@ function useDelay() {
 
 // ---------------------------------------------------------------- the parts
 
-// A button that was pressed with the mouse does not get the focus: Space shall stop afterwards, not drive.
+// A button that was pressed with the mouse does not get the focus, so that Space afterwards stops, and does not drive.
 const prevent = (event) => event.preventDefault();
 
 function PadButton({ motion, symbol, words, letter }) {
@@ -120,7 +120,7 @@ function PadButton({ motion, symbol, words, letter }) {
   };
   const keyUp = (event) => isHoldKey(event) && up();
   const held = store.press?.motion === motion;
-  // Not `disabled`: a button that is disabled while it is held would lose the release.
+  // `aria-disabled`, not `disabled`: a button that is disabled while it is held would lose the release.
   return html`<button class=${held ? "pad held" : "pad"} data-motion=${motion} aria-disabled=${isRefused("move", names())} aria-label=${`${words}, hold`}
     aria-pressed=${held} onPointerDown=${down} onPointerUp=${up} onPointerCancel=${up} onLostPointerCapture=${up}
     onKeyDown=${keyDown} onKeyUp=${keyUp} onBlur=${up} onMouseDown=${prevent} onContextMenu=${prevent}>
@@ -176,7 +176,7 @@ const Distance = ({ range_m }) => html`<span class="gauge"><span class="dim">${t
 }</strong><span class="bar wide-bar" aria-hidden="true"><span style=${{ transform: `scaleX(${Math.min(1, (range_m ?? 0) / FULL_BAR_M)})` }}></span></span></span>`;
 
 const Lights = ({ values }) => html`<span class="lights" aria-hidden="true">${values.map((on) => html`<span class=${on ? "on" : ""}></span>`)}</span>`;
-// Lights in the order of the sensors, and their words: unseen ones where the lights say enough.
+// Lights in the order of the sensors, and their words. `unseen` hides the words, if the lights say enough.
 const Sides = ({ name, values, words, isAlarm, unseen }) => html`<span class=${isAlarm && values?.some(Boolean) ? "gauge bad" : "gauge"}
   ><span class="dim">${name}</span> ${values ? html`<${Lights} values=${values} /> <strong class=${unseen ? "unseen" : ""}>${words(values)}</strong>` : html`<strong>${t.noReading}</strong>`}</span>`;
 const named = (names, values) => names.filter((_, at) => values[at]);
@@ -224,7 +224,7 @@ function Lend({ cars }) {
   const [to, setTo] = useState("");
   const [minutes, setMinutes] = useState(10);
   const chosen = people.includes(to) ? to : (people[0] ?? to);
-  if (isRefused("lend", names())) return null; // as of a pupil
+  if (isRefused("lend", names())) return null; // a pupil may not lend cars
   return html`<section data-control="lend">
     <h2>${t.lend}</h2>
     <fieldset class="bare controls">
@@ -246,7 +246,7 @@ function Lend({ cars }) {
 
 const ACTS = ["led", "light", "whistle"];
 
-// A control that all cars have. What some lack is in `Lacking`.
+// A control that all chosen cars have. Controls that some of them lack are in `Lacking`.
 const lacking = (cars, needs) => cars.filter((car) => needs in car.cannot);
 function Offer({ title, needs, cars, children }) {
   if (lacking(cars, needs).length > 0) return null;
@@ -256,7 +256,7 @@ function Offer({ title, needs, cars, children }) {
   </section>`;
 }
 
-// What not all cars can do: one line, and behind it which car lacks what, and why.
+// What not all chosen cars can do, in one line. Unfolded, it says which car lacks what, and why.
 const OFFERS = [
   [t.mode, "mode"], [t.speed, "speed"], [t.led, "led"], [t.light, "light"], [t.sounds, "whistle"], [t.servo, "servo_deg"],
   [t.servoNames.vertical, "servo_vertical"], [t.servoNames.horizontal, "servo_horizontal"], [t.arm, "arm"], [t.fan, "fan"],

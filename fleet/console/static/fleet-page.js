@@ -72,7 +72,7 @@ const Motion = ({ car }) =>
     ? html`<strong>${car.motion.motion in arrows ? arrows[car.motion.motion][1] : t.isMoving}</strong>`
     : html`<${Verdict} table=${tileMotors} name=${motorName(car)} />`;
 
-// What keeps a car, or who has it.
+// Who drives a car or has borrowed it, and whether it is on hold.
 function markOf(car) {
   const driver = driverOf(car);
   const kept = car.hold !== null ? t.holdMark : car.loan !== undefined ? t.lentMark(car.loan.to) : "";

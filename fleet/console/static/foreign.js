@@ -12,5 +12,5 @@ export const seen = (text) => text.replace(UNSEEN, "").split("\n").map(isolated)
 const SENT_BACK = new Set(["text", "id", "name", "url"]);
 const clean = (key, value) => (typeof value === "string" && !SENT_BACK.has(key) ? seen(value) : value);
 
-// Ten times a second: only a message with such a character (the console escapes it) is read slowly.
+// Messages come ten times a second. So only one that may have such a character (the console escapes it) is read slowly.
 export const parse = (text) => JSON.parse(text, /\\u|[^\x20-\x7e]/.test(text) ? clean : undefined);

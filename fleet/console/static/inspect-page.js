@@ -68,7 +68,7 @@ const Doctor = ({ doctor }) => html`<section data-doctor>
     <dd class=${isDoubtful ? "doubt" : ""}>${isDoubtful ? html`<strong>? ${t.notShown}:</strong> ` : ""}${words}</dd></div>`)}</dl>
 </section>`;
 
-// The same words as on all other pages.
+// The state of the car in the same words as on all other pages.
 const State = ({ car }) => {
   const troubles = troublesOf(car);
   return html`<p data-state class=${troubles.length > 0 ? "bad" : ""}><strong>${car.name}</strong>: ${

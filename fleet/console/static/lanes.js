@@ -3,7 +3,7 @@
 import { on, unwish, wish } from "./console.js";
 import { spanOf } from "./spans.js";
 
-const KEPT_MS = 900_000; // as long as the console itself
+const KEPT_MS = 900_000; // as long as the console itself keeps them
 
 const live = new Map();
 on("lanes", ({ spans }) => {
@@ -13,7 +13,7 @@ on("lanes", ({ spans }) => {
 });
 export const liveSpans = () => [...live.values()];
 
-// Ask for them while a page shows them. Return what ends it.
+// Ask for the lanes while a page shows them. Return a function that ends this.
 export function showLanes() {
   wish({ t: "lanes" });
   return () => unwish("lanes", { t: "lanes_end" });

@@ -18,7 +18,7 @@ const placesOf = (cars) => Object.fromEntries(Object.entries(cars).map(([car, pl
 on("map", (message) => {
   const trails = grown(live.trails, message, consoleNow());
   live = { ...live, places: placesOf(message.cars), trails, version: live.version + 1 };
-  return false; // the next state draws it, which comes as often
+  return false; // the next state draws it: states come as often as this message
 });
 on("world", ({ world }) => {
   live = { ...live, world, version: live.version + 1 };
@@ -57,7 +57,7 @@ const CarMark = ({ car, place, size, letter, isChosen }) => html`<g data-mark=${
   ${isBad(car) && html`<text class="mark-trouble" x=${place.x} y=${-place.y + size * 0.6 + 2.1 * letter} font-size=${letter}>⚠ ${t.mapTroubles[troublesOf(car)[0].name] ?? troublesOf(car)[0].short}</text>`}
 </g>`;
 
-// Drawn when the console has told something new, or something else is chosen.
+// Drawn again only when the console has told something new, or something else is chosen.
 class Floor extends Component {
   shouldComponentUpdate(next) {
     return ["version", "chosen", "frame", "box", "width", "looks"].some((name) => next[name] !== this.props[name]);

@@ -31,7 +31,7 @@ function useSessions() {
   return [found, read];
 }
 
-// The live spans change with each message: one array for each second is enough to look at.
+// The live spans change with each message. For the eye, a new array each second is enough.
 let liveMade = { at: 0, begin: 0, spans: [] };
 const liveNow = () => {
   const at = Math.floor(consoleNow() / 1000);

@@ -9,7 +9,7 @@ export const route = () => location.hash.replace(ROUTE_END, "");
 
 // ---------------------------------------------------------------- the lanes of a recording
 
-let opened = null; // {name, loading, spans, marks, begin, end, cars, words}: of one recording at a time
+let opened = null; // {name, loading, spans, marks, begin, end, cars, words}: of only one recording at a time
 export const lanesOf = (name) => (opened?.name === name ? opened : null);
 
 export function openSession(name, { again = false } = {}) {
@@ -103,7 +103,7 @@ async function readAddress() {
     if (store.past?.session !== session || store.past.at_ms !== at_ms) jump(session, at_ms);
     return;
   }
-  const { begin, words } = await openSession(session); // which another one may have replaced meanwhile
+  const { begin, words } = await openSession(session); // another session may have replaced this one meanwhile
   if (begin !== undefined) jump(session, begin);
   else showPast({ ...NOTHING, session, at_ms: 0, words: words || describe.unreachable });
 }

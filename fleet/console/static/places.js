@@ -1,7 +1,7 @@
 // Where each car stands on the pages. Pure. A car keeps its place while the page is open, whoever comes and goes: a press
 // must not meet another car than the one that the eye has chosen.
 
-// Anybody on the bus may invent cars, which are forgotten again. With more empty places than this, the oldest is used again.
+// Anybody on the bus may invent cars, which leave empty places. Beyond this number, the oldest one is used again.
 const MAX_EMPTY = 16;
 
 // Return the name of each place. A car that has gone leaves its name there. New cars come behind all others, own ones first.

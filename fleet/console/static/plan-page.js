@@ -11,7 +11,7 @@ let inForce = { plan: null, running: false, log: [] };
 on("plan", (message) => {
   inForce = message;
 });
-let answer = null; // of the last request about the plan: {ok, words}
+let answer = null; // to the last request about the plan: {ok, words}
 on("plan_done", (message) => {
   answer = message;
 });
@@ -105,7 +105,7 @@ function Answer({ onFault }) {
   </ul></div>`;
 }
 
-// What another plan would change, and what each car would do first. Nothing moves for it.
+// What another plan would change, and what each car would do first. This is only computed: no car moves.
 const modeName = (mode) => (mode in modes ? modes[mode][0] : mode);
 function Trial({ found }) {
   const what = (change) => (change.added ? t.planAdded : change.removed ? t.planRemoved : t.planChanged);

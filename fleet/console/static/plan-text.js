@@ -20,7 +20,7 @@ const line = ([name, fields]) =>
     .map(([field, value]) => `${field}: ${written(value)}`)
     .join(", ")}}\n`;
 
-// The text with these roles in place of its own. All else stays, comments among the roles do not.
+// The text with these roles in place of its own. All else stays, except comments among the roles.
 export function withRoles(text, roles) {
   const block = `roles:${roles.length === 0 ? " {}" : ""}\n${roles.map(line).join("")}`;
   const lines = text.split("\n");
@@ -28,7 +28,7 @@ export function withRoles(text, roles) {
   if (begin < 0) return text.trim() === "" ? block : `${block}${text}`;
   let end = begin + 1;
   while (end < lines.length && !/^[^\s#]/.test(lines[end])) end += 1;
-  // Empty lines and comments at the margin before the next part belong to that.
+  // Empty lines and comments at the margin before the next part belong to the next part.
   while (end > begin + 1 && end < lines.length && /^(#.*|\s*)$/.test(lines[end - 1])) end -= 1;
   return [...lines.slice(0, begin), block.trimEnd(), ...(end < lines.length ? lines.slice(end) : [""])].join("\n");
 }

@@ -11,7 +11,7 @@ import uPlot from "./vendor/uplot.js";
 const PLOTS = 4;
 // One slot for each two pixels or so: drawing costs the same whatever the rate and the time shown.
 const SLOTS = 600;
-// More often is not smoother, and at 25 Hz uPlot's memory swings between 99 and 749 MB.
+// Drawing more often does not look smoother, and at 25 Hz uPlot's memory swings between 99 and 749 MB.
 const DRAW_MS = 100;
 const FIRST = ["sensor/range range_m", "sensor/battery voltage_v", "sensor/line left_inner", "state/motion speed"];
 
@@ -28,7 +28,7 @@ class Grid {
     const slots = [...this.rows[row].keys()];
     return slots.length === 0 ? "–" : this.rows[row].get(Math.max(...slots));
   }
-  // What it had when it was paused, so that nothing scrolls away under the eye.
+  // The values at the moment of the pause, so that nothing scrolls away under the eye.
   kept() {
     this.frozen ??= this.data();
     return this.frozen;
@@ -60,7 +60,7 @@ const titleOf = (offered, reading) => {
   return `${words(topic, field)}${unitOf(found?.[2])}`;
 };
 
-// A line of a color that one does not see on this ground is drawn in ink, with gaps.
+// If a car's color is hard to see on the background, its line is drawn in the color of the text, with gaps.
 const MIN_CONTRAST = 1.6;
 function brightness(color) {
   const parts = /^#/.test(color) ? [1, 3, 5].map((at) => parseInt(color.slice(at, at + 2), 16)) : color.match(/\d+/g).slice(0, 3).map(Number);
@@ -192,7 +192,7 @@ export function PlotsPage({ cars }) {
   const [view, setView] = useState(null); // {from, to} in s, while paused
   const offered = store.hello?.plottable ?? [];
   const isPast = store.past !== null;
-  // The values before the moment that is shown: of other series they come in a moment.
+  // The values before the moment that is shown. null until those of the chosen series have come.
   const samples = isPast && isOf(store.past.shown, readings, shown, span_s) ? store.past.samples : null;
   useEffect(showLanes, []);
 

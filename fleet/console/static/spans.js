@@ -26,7 +26,8 @@ export const previousTime = (times, at) => times.findLast((each) => each < at - 
 export const saidAt = (spans, car, at, late_ms = 0) =>
   LANES.map((lane) => spans.findLast((each) => each.car === car && each.lane === lane && each.begin <= at && at <= each.end + late_ms)).filter(Boolean);
 
-// What began around a moment, the oldest first: [at, car, lane, words, bad]. A person who presses a pad again and again drives on.
+// What began around a moment, the oldest first: [at, car, lane, words, bad]. Presses of one person soon after each
+// other count as one.
 const DRIVES_ON_MS = 15_000;
 export function around(spans, marks, at, near_ms) {
   const isNear = ([when]) => Math.abs(when - at) <= near_ms;

@@ -21,7 +21,7 @@ const WORDS_OF = { mode: modeWords, driver: (words) => t.drivenMark(who(words)),
 const wordsOf = ({ lane, words }) => WORDS_OF[lane]?.(words) ?? words;
 const sessionWords = (each) => `${when(each)}, ${lengthWords(each.length_s)}`;
 
-// Drawn again only when its spans, or the window, are others.
+// Drawn again only when its spans or the window have changed.
 class CarLanes extends Component {
   shouldComponentUpdate(next) {
     return next.spans !== this.props.spans || next.from !== this.props.from || next.to !== this.props.to;

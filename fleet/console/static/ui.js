@@ -9,7 +9,7 @@ import { t } from "./texts.js";
 export const html = htm.bind(h);
 export { Component, render, useEffect, useRef, useState };
 
-// Made once: Preact passes over what is the same as before, ten times a second.
+// Each icon is made once: ten times a second, Preact passes over an element that is the same as before.
 const icons = new Map();
 export const Icon = ({ path }) => {
   if (!icons.has(path)) icons.set(path, html`<svg class="icon" viewBox="0 0 24 24" aria-hidden="true"><path d=${path} /></svg>`);
@@ -72,8 +72,8 @@ export function Battery({ battery }) {
 // Why an action is refused, before it is tried.
 export const Refused = ({ words }) => words.map((each) => html`<p class="cannot refused" key=${each}>${each}</p>`);
 
-// Cards are drawn some in each task, so that a press of STOP does not wait for all.
-// Layout and paint of twenty cards keep a phone busy, so what is out of view is drawn once a second.
+// A few cards are drawn in each task, so that a press of STOP does not wait for all of them. Layout and paint of twenty
+// cards keep a phone busy, so cards out of view are drawn once a second.
 const OUT_OF_VIEW_MS = 1000;
 const CARDS_IN_A_TASK = 4;
 const outdated = new Set();
