@@ -23,7 +23,8 @@ from schemas.words import ProcessKind, RunState
 SUPERVISOR_POLL_INTERVAL_S: Final = 0.1
 """Interval at which the supervisor polls its processes."""
 STARTS_AT_ONCE: Final = 1 + (os.cpu_count() or 1)
-"""Maximum number of gateways that start at the same time. Each needs 0.3 s of CPU time, with waits in between."""
+"""Maximum number of gateways that start at the same time. A start takes 0.3 s of CPU time, but a gateway also waits in
+between."""
 MISSED_HEARTBEAT_S: Final = 2.0
 """Silence after which a process counts as silent: it has missed one heartbeat."""
 CPU_CHECK_SILENCE_S: Final = 1.0
@@ -61,8 +62,9 @@ class ManagedProcess(Struct):
 class ProcessSet:
     """All processes of one supervisor, by name.
 
-    on_event: called with a process's name and a text. on_line: called with each line of its stdout. on_exit: called
-    when it has ended, with True if the supervisor ended it.
+    on_event: called with a process's name and a text. on_line: called with each line of a process's stdout, returns
+    False if the line should not be logged. on_exit: called when a process has ended, with True if the supervisor ended
+    it.
     """
 
     def __init__(
@@ -97,7 +99,11 @@ class ProcessSet:
         return [process for process in self if process.kind in kinds]
 
     def add(self, name: str, kind: ProcessKind, command: tuple[str, ...], *, restart: bool = False) -> None:
-        """Add a process. If one of this name exists, restart it if its command differs or `restart` is True."""
+        """Add a process.
+
+        A process of this name is restarted if its command differs, if it is ending for good or was refused, or if
+        `restart` is True.
+        """
         process = self._processes.get(name)
         if process is None:
             log = Log(self.directory / f"{name}.log")

@@ -23,7 +23,8 @@ WRONG_USE: Final = 2
 """Exit code of a process that rejects its arguments. A restart seldom helps."""
 WRONG_USE_RETRY_S: Final = 60.0
 """Interval of retries after WRONG_USE. The supervisor never gives up: the user may fix a file or a device."""
-# A gateway leaves the bus only after its car has shown the stop. Leaving takes up to two seconds.
+# After SIGTERM, a gateway stops its car and waits up to SHUTDOWN_S for readings that show the stop. Then it leaves the
+# bus, which takes up to two seconds.
 GATEWAY_GRACE_S: Final = SHUTDOWN_S + 3.0
 """Timeout for a gateway's exit after SIGTERM. Then the supervisor kills it."""
 HUNG: Final = "hung"

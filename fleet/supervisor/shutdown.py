@@ -35,8 +35,8 @@ CAR_LINK_TIMEOUT_S: Final = 8.0
 class GatewayShutdown:
     """The gateways that are being shut down.
 
-    A gateway that crashed or was killed before its car stopped is always replaced once. A gateway that reports that it
-    could not stop its car is replaced until `hurry`, if a gateway has ever reached the car.
+    A gateway that crashed or was killed before its car stopped is always replaced once. If a gateway has ever reached
+    the car, each gateway that reports that it could not stop the car is replaced, until `hurry` is called.
 
     `on_result` is called with a car's name and the result. `exists` returns False if the car was a simulated one whose
     simulator has ended.
@@ -57,7 +57,8 @@ class GatewayShutdown:
         self._pending: dict[str, ManagedProcess] = {}
         self._awaited: set[str] = set()
         """Gateways that get SIGTERM once they have reached their car."""
-        # Several attempts may be needed: a port may need a moment after its gateway was killed.
+        # Several attempts may be needed: after a gateway was killed, its port may need a moment until it can be opened
+        # again.
         self._tries: dict[str, int] = {}
         """Number of new gateways that were started to stop a car."""
         self._unclaimed: dict[str, float] = {}
@@ -137,7 +138,10 @@ class GatewayShutdown:
             self._finish(process, words)
 
     def _finish_claimed(self, process: ManagedProcess) -> None:
-        """Finish a gateway that ended normally. Its last claim says whether the car has shown its stop."""
+        """Finish a gateway that ended normally.
+
+        Its last state/safety says whether readings have shown that the car stands.
+        """
         row = self._rows.get(process.name)
         if row is not None and row.motors.what == Motors.OFF:
             self._finish(process, rest_words(row.motors, process.name))

@@ -41,7 +41,8 @@ SELF: Final = "@supervisor"
 
 
 PATIENCE: Final[Mapping[ProcessKind, Patience]] = {
-    # Clients reconnect within 0.5 s, and Zenoh's lease is 2 s. A hub that stalls for 6 s need not be replaced.
+    # A hub that stalls for 6 s need not be replaced: links to it break after Zenoh's lease of 2 s, but clients try to
+    # reconnect each 0.5 s.
     ProcessKind.HUB: Patience(start_s=10.0, silence_s=8.0),
     ProcessKind.SIMULATOR: Patience(start_s=20.0, silence_s=5.0),  # queried each second
     ProcessKind.GATEWAY: Patience(start_s=20.0, silence_s=4.0, to_the_end=True),  # state/health each second
@@ -264,8 +265,9 @@ def gateway_command(spec: FleetSpec, car: CarProcessSpec, link: str, endpoint: s
     """Return the command of a car's gateway."""
     where = ("--fleet", spec.fleet, "--connect", endpoint, "--retry", *parent_option())
     options = ("--car", car.name, "--link", link, "--platform", car.platform, *car.arguments)
-    # The link of a simulated car changes with each run. So its holds belong to the folder of the
-    # fleet: the next run in that folder has the same car.
+    # A gateway keeps its car's holds (a stopped car stays stopped) under the car's link. The link of a simulated car
+    # changes with each run, so its holds are kept under the fleet's folder: the next run in that folder has the same
+    # car.
     folder = (Path.cwd() if spec.file is None else spec.file.parent).resolve()
     same = ("--holds-of", f"{SIMULATED} in {folder}") if car.link == SIMULATED else ()
     return module("gateway.cli", "run", *options, *same, *where)

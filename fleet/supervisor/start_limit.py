@@ -13,14 +13,18 @@ START_SLOT_TIMEOUT_S: Final = 10.0
 """Maximum time for which a starting process delays others, because one that hangs must not block them."""
 RESTARTS_AT_ONCE: Final = 16
 RESTART_INTERVAL_S: Final = 1.0
-"""Interval of further restarts in the whole fleet. A restart takes 0.3 to 0.7 s of CPU time."""
+"""Interval of restarts in the whole fleet after the first RESTARTS_AT_ONCE. A restart takes 0.3 to 0.7 s of CPU
+time."""
 KILLS_AT_ONCE: Final = 3
 KILL_INTERVAL_S: Final = 5.0
-"""Interval of further kills of hung processes in the whole fleet."""
+"""Interval of kills of hung processes in the whole fleet after the first KILLS_AT_ONCE."""
 
 
 class Admission:
-    """Limits concurrent starts. A start ends with the first heartbeat or after START_SLOT_TIMEOUT_S."""
+    """Limits concurrent starts to `places`, and the rates of restarts and kills.
+
+    A start ends with the first heartbeat or after START_SLOT_TIMEOUT_S.
+    """
 
     def __init__(self, places: int) -> None:
         self._places = places

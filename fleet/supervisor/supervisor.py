@@ -52,7 +52,8 @@ HUB_START_TIMEOUT_S: Final = 10.0
 SUPERVISOR_HUB_RESTART_DELAY_S: Final = 0.3
 """Time without a link after which the supervisor restarts the hub. Other programs would start one after 0.5 s."""
 RECORDER_START_TIMEOUT_S: Final = 5.0
-"""Timeout for the recorder's first heartbeat. Gateways start only then, so that the recorder misses nothing."""
+"""Timeout for the recorder's first heartbeat. Gateways start only after this heartbeat or timeout, so that the recorder
+misses nothing."""
 RECORDER_LOST_S: Final = 2.0
 """Time without a status of a recorder after which the fleet counts as not recorded. A recorder sends one each
 second."""
@@ -81,7 +82,7 @@ class SupervisorEvent(Struct, frozen=True):
 
 
 class Supervisor:
-    """Keeps the processes of a fleet running. `run` returns True if every car was stopped.
+    """Keeps the processes of a fleet running. `run` returns True if no car may be moving and everything was recorded.
 
     `read` reads the spec again for a reload, and raises ValueError if it is invalid. `on_event` gets each event.
     """
@@ -252,7 +253,7 @@ class Supervisor:
             self._service is not None and not linked and now - self._unlinked_since >= SUPERVISOR_HUB_RESTART_DELAY_S
         )
         due = hub.status.state is RunState.WAITING and now >= hub.status.due
-        refused = hub.status.state is RunState.REFUSED  # we may not start a hub on this network, and its router is back
+        refused = hub.status.state is RunState.REFUSED  # our hub may not listen at this endpoint
         if (refused and linked) or (due and await asyncio.to_thread(accepts, self.endpoint)):
             hub.status.served_elsewhere(now, f"another program's hub listens at {self.endpoint}")
         elif hub.status.state is RunState.ELSEWHERE and is_lost and not await asyncio.to_thread(accepts, self.endpoint):

@@ -1,4 +1,4 @@
-"""Runs a gateway for one link for a moment, under a temporary name: its car blinks, and a person names it."""
+"""Runs a gateway for one link for a moment, under a temporary name: a person sees its car blink, and names it."""
 
 import contextlib
 import subprocess
