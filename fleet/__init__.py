@@ -4,8 +4,8 @@
 A `Catalog` answers questions about all recordings.
 """
 
-# Do not import this name from `typing`, which would take longer than all the rest of this module. The `fleet` command
-# handles Ctrl-C only after this module is imported.
+# Do not import TYPE_CHECKING (below) from `typing`: that would take longer than all the rest of this module. The
+# `fleet` command handles Ctrl-C only after this module is imported.
 from __future__ import annotations
 
 from importlib import import_module

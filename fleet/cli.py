@@ -284,7 +284,7 @@ def _command_path(error: click.UsageError) -> str:
 def _one_line(error: click.ClickException) -> str:
     """Return the message on one line.
 
-    The messages of our own types already quote the wrong word, so leave out the name of an argument.
+    The messages of our own parameter types already quote the wrong word, so the name of the argument is left out.
     """
     if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
         option = f"{error.param.opts[-1]}: " if isinstance(error.param, click.Option) else ""

@@ -221,7 +221,10 @@ class _Refusals(logging.Handler):
             self._found.append(int(found[1]))
 
     def take(self, known: Container[int]) -> set[int]:
-        """Return those of the `known` channels that refused a client. Keep the others: they may still be opened."""
+        """Return those of the `known` channels that refused a client.
+
+        Keep the refusals of other channels, which may become known soon.
+        """
         found = [self._found.popleft() for _ in range(len(self._found))]
         self._found.extend(each for each in found if each not in known)
         return {each for each in found if each in known}

@@ -257,8 +257,8 @@ class CarState(Struct):
             return "silent: is it switched on?"
         if safety.waits_for:
             return f"waits for {safety.waits_for}"
-        # Some cars never send a byte. So the motors' states `off` and `on` count before any byte has come. Their other
-        # states do not.
+        # Some cars never send a byte. So the motors' states `off` and `on` count before any byte has come, but the
+        # other states of the motors do not.
         heard = safety.motors in (Motors.OFF, Motors.ON) or (safety.motors and self.last_rx_s is not None)
         return None if heard else NEVER_HEARD
 

@@ -22,8 +22,8 @@ SEND_AGAIN_INTERVAL_S: Final = 0.5
 """Interval at which a stop without an answer is sent again. A Zenoh session that has lost its hub tries to connect
 again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
-"""Interval at which a stop without an answer checks whether the bus is there. A Zenoh session that has lost its hub
-stays without one for at least twice as long."""
+"""Interval at which a stop without an answer checks whether the bus is there. A Zenoh session that has lost its hub has
+no hub for at least twice this time, so no loss is overlooked."""
 _MAX_QUEUED_ITEMS: Final = 4096
 """Maximum number of unread answers and events of a command. Each of up to some hundred cars sends a few."""
 
@@ -67,12 +67,12 @@ Item = tuple[float, Any]
 class PendingCommand:
     """One command to some cars. `wait` runs on the caller's thread, other threads fill the inbox."""
 
-    # A stop must not miss a car whose gateway hangs: after 2 s its token is gone, and a wildcard query no longer
-    # reaches it. Therefore a stop is also for the cars that a supervisor knows, and is sent again to their new
-    # gateways. A stop could also be lost with the bus: a hub that hangs accepts the query, and drops it when Zenoh
-    # takes the hub for dead (after its lease, 2 s) and cuts the hub's links. So a stop that a gateway has not answered
-    # is sent again when the bus is back, as long as gateways accept a stop of that age (STOP_TTL_S). A car that has
-    # answered does not get the stop again, because a person may have released the car meanwhile.
+    # A stop must not miss a car whose gateway hangs: after 2 s its token (the sign that it is on the bus) is gone, and
+    # a wildcard query no longer reaches it. Therefore a stop is also for the cars that a supervisor knows, and is sent
+    # again to their new gateways. A stop could also be lost with the bus: a hub that hangs accepts the query, and drops
+    # it when Zenoh takes the hub for dead (after its lease, 2 s) and cuts the hub's links. So a stop that a gateway has
+    # not answered is sent again when the bus is back, as long as gateways accept a stop of that age (STOP_TTL_S). A car
+    # that has answered does not get the stop again, because a person may have released the car meanwhile.
 
     def __init__(
         self,
@@ -272,7 +272,7 @@ class PendingCommand:
                 self._stop_again(progress)
 
     def _stop_again(self, progress: Progress) -> None:
-        """Send the stop to a gateway that joined the bus after the first query."""
+        """Send the stop again to a car without an answer. The first query may not have reached its gateway."""
         if self.is_stop and not progress.answered and progress.outcome is None:
             self._open += 1
             self._unanswered_at.pop(progress.car, None)

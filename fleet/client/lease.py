@@ -175,7 +175,7 @@ class Lease(Generic[C_co]):
         while not self._over.wait(LEASE_RENEWAL_INTERVAL_S) and not self._monitor.lost:
             try:
                 (outcome,) = self._fleet.ask(lease_request(), [self._name])
-            except (BusError, RuntimeError):  # the Fleet is closed, and so is its token
+            except (BusError, RuntimeError):  # the Fleet is closed, and its token is gone
                 return
             self._monitor.on_outcome(outcome)
 

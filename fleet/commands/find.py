@@ -133,7 +133,7 @@ def _search(
             yield path, found
             for words in found.left_out.words():
                 echo_safely(f"{path.name}: not searched: {words}", err=True)
-        # A file that cannot be read may be newer than the others, so report it even if the session was not searched.
+        # A file that cannot be read may be newer than `since_ns`, so report it even if the session was not searched.
         if words := session.damage_words or (about.words if is_searched else ""):
             echo_safely(f"{path.name}: only what is intact was searched: {words}", err=True)
     if there and (missing := sorted({*cars} - there)):

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     )
     from fleet.replay.analysis.replan import Replanning
 
-# Live, a car's token shows at once that the car has gone. A recording has only its states, which come once a second. So
-# a replay notices this up to a second later.
+# Live, a car's token shows at once that the car has gone. A recording has only the car's states, which come once a
+# second. So a replay notices this up to a second later.
 TOLERANCE_S: Final = 2.0
 """Default time by which a decision may come earlier or later and still count as the same."""
 

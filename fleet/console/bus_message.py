@@ -46,7 +46,7 @@ def is_shown(name: str) -> bool:
 def is_finite(message: Any) -> bool:
     """Return True if all numbers of a message are finite.
 
-    JSON has no other numbers, so a page could not read its state.
+    JSON has no other numbers, so a page could not read a state that contains one.
     """
     return all(_is_finite(value) for _, value in message.ListFields())
 

@@ -345,7 +345,7 @@ class Console:
         return self._operators.own
 
     def operator_of(self, person: PagePerson | None) -> ConsoleOperator:
-        """Return the operator of a request, or None if it comes from this computer."""
+        """Return the operator of a request. `person` is None if the request comes from this computer."""
         return self.operator if person is None else self._operators.of(person.name)
 
     def sender_of(self, person: PagePerson | None) -> str:

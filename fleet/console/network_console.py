@@ -131,8 +131,8 @@ class Lan:
         self._failures = LogLimit()
         self._shared_cookies = LogLimit()
         self._connected: dict[int, tuple[str, str, Callable[[], object], Callable[[], object]]] = {}
-        """By number of the socket: its device, its address, and two functions. One closes it for good, one only for a
-        moment."""
+        """By number of the socket: its device, its address, and two functions. The first one closes the socket for
+        good, the second one lets the page connect again."""
         self._last_socket = 0
         self.people.serve()
         self._write(listed)

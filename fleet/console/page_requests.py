@@ -50,7 +50,7 @@ class PageMessage(Struct, frozen=True):
 
     @property
     def kind(self) -> str:
-        """What the page wants."""
+        """The kind of the message. It says what the page wants."""
         return self.text("t", 16)
 
     def text(self, name: str, longest: int = 64) -> str:

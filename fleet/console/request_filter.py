@@ -128,7 +128,8 @@ class NetworkGuard(Guard):
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> str:
         host = headers.get("host", "").lower()
-        # The address at which the connection arrived is ours. An attacker's name cannot look like an IP address.
+        # A stranger's page, whose host name leads to this computer, sends that name as Host (DNS rebinding). The
+        # address at which the connection arrived is ours, and no host name looks like an IP address.
         address, port = scope["server"]
         ours = {f"{name}:{port}" for name in (*self._names(), address)}
         if port == _HTTPS_PORT:

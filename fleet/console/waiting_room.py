@@ -23,8 +23,8 @@ TOTAL_BURST: Final = 1000.0
 """Handshakes of all addresses at once. Even if three addresses flood, some are left for the rest."""
 TOTAL_RATE: Final = 100.0
 MAX_HANDSHAKES_PER_ADDRESS: Final = 16
-"""Maximum number of unfinished handshakes of one address. It is less than the number of strangers that an address may
-have."""
+"""Maximum number of unfinished handshakes of one address. It is less than the 24 strangers that an address may have
+(`connection_limit`)."""
 MAX_WAITING_PER_ADDRESS: Final = 160
 """Maximum number of connections in one line. In a flood of 1000 connections a second without a hello, an honest client
 has 0.16 s to send its hello."""

@@ -108,8 +108,8 @@ class Coordinator:
                 for query in self._early:
                     self._answer(query, observer)
                 while not has_ended():
-                    # Read the hubs before the inbox. If a hub is gone by then, the inbox already says which gateways
-                    # were lost with it.
+                    # Read the hubs before the inbox. If a hub is gone at that moment, the inbox says afterwards which
+                    # gateways were lost with it.
                     linked_hubs = bus.hubs
                     self._drain_inbox(observer, pool)
                     now = time.monotonic()
@@ -130,7 +130,8 @@ class Coordinator:
                         yield_to_another(self.client)
                     self._publications.republish(now)
                 if not self.run_name and self._memory.stopped_by:
-                    # A person who ends a coordinator by hand and starts another one wants the plan to run.
+                    # A person who ends a coordinator by hand and starts another one wants the plan to run. So forget
+                    # that it was stopped.
                     self._save(replace(self._memory, stopped_by="", to_rest=frozenset()))
             finally:
                 self.client.close()  # ends pending commands

@@ -32,7 +32,7 @@ class AdapterCheck(Struct, frozen=True):
     notifications_per_s: int
     """Maximum number of notifications per second that its cars send together."""
     is_crowded: bool
-    """True if some adapters can hold fewer connections, or carry fewer notifications."""
+    """True if this load is too high for some models of adapters."""
     words: str
 
 
@@ -52,7 +52,7 @@ def check_adapters(links: Mapping[str, FleetLink], adapters: Sequence[str]) -> I
     for car, link in links.items():
         if isinstance(link, BleUrl):
             by_adapter.setdefault(link.adapter or first, []).append(car)
-    if AUTO_ADAPTER in by_adapter:  # a car that may use any adapter may share it with the cars of each
+    if AUTO_ADAPTER in by_adapter:  # a car with `auto` may share its adapter with any other car
         by_adapter[AUTO_ADAPTER] = [car for cars in by_adapter.values() for car in cars]
     for adapter, cars in by_adapter.items():
         yield _sum(adapter, cars, max(1, len(adapters)) if adapter == AUTO_ADAPTER else 1)

@@ -2,9 +2,9 @@
 
 The hub starts this process, because the hub itself has no access to the authority's key.
 
-It reads one request from stdin and writes the certificate to stdout, or the reason why there is none to stderr:
-`python -m fleet.hub.renewals --endpoint tls/127.0.0.1:7447 --identity person.mia`. Without an identity it renews the
-hub's own certificate, if that is due.
+This process reads one request from stdin and writes the certificate to stdout, or the reason why there is none to
+stderr: `python -m fleet.hub.renewals --endpoint tls/127.0.0.1:7447 --identity person.mia`. Without an identity it
+renews the hub's own certificate, if that is due.
 """
 
 import argparse

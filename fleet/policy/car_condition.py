@@ -51,8 +51,8 @@ class CarCondition:
     def add(self, topic: str, message: Any, at_ns: int) -> HeldStep | None:
         """Add a message of one of `topics`. Return None if the message is older than the newest one of its topic.
 
-        at_ns: the message's own time. If it is older by more than CLOCK_STEP_S, somebody has set the clock back.
-        Everything then begins again.
+        at_ns: the message's own time. If it is more than CLOCK_STEP_S before that of the newest one, somebody has set
+        the clock back. The condition is then evaluated from the beginning.
         """
         newest_ns, before = self._newest.get(topic, (at_ns, None))
         ended = None

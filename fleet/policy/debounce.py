@@ -19,6 +19,7 @@ class Debounced(Struct, frozen=True):
     since: float
     """The time since which the condition has been true without a break."""
     otherwise_since: float | None = None
+    """Time since which the value has been false or unknown, while `on` still holds. None if the value is true."""
 
 
 def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the value itself

@@ -515,7 +515,7 @@ def _command_blinks(
             continue
         for car in targets(effect, state, subjects, allocation.roles):
             if car in result or car not in candidates.free or not _obeys_led(snapshot.cars.get(car, UNKNOWN_CAR)):
-                continue  # an earlier rule has set the LED of this car
+                continue  # an earlier rule has set its LED, or it obeys no color now
             last = before.get(car)
             if last is not None and last.color == effect.led and now - last.at < effect.blink_s:
                 result[car] = last

@@ -21,7 +21,8 @@ from schemas.words import LinkState, Reason, Verdict
 REFUSED_MODE_RETRY_S: Final = 10.0
 """Delay before the next request of a mode that a car refused."""
 _REFUSALS: Final = frozenset({Reason.BATTERY_LOW, Reason.UNSUPPORTED, Reason.LINK_DOWN, Reason.WRITE_FAILED})
-"""Reasons that lie with the car itself. Holds and leases are not among them, because the car's states show them."""
+"""Reasons of a refusal that lie with the car itself. Holds and leases are left out, because the car's states show
+them."""
 _STAND_IN: Final = "/"
 """Suffix of a role's name. It marks the places of the role that stand in for another role."""
 _ROLE_LOSS_COST: Final = 1_000_000_000
@@ -94,8 +95,8 @@ class Candidates(Struct, frozen=True):
             return None
         if settled is not None:
             return Barrier(f"it needs {role.needs_text}", f"{role.needs_text} becomes true", role.needs)
-        # In most modes, a car measures little. A car that is already in the role's mode keeps it, although its needs
-        # are not known.
+        # In most modes, a car measures little. So a car that is already in the role's mode keeps the role, although
+        # nobody knows whether the car meets the role's needs.
         if self.roles_before.get(car) == role.name or (car not in self.roles_before and known.mode == role.mode):
             return None
         why, change = f"it needs {role.needs_text}, and that is not known", f"{role.needs_text} is measured"
@@ -184,7 +185,7 @@ def allocate(candidates: Candidates) -> RoleAllocation:
     }
     costs = _costs(candidates)
     places, stands_in = dict(counts), dict[str, str]()
-    # The fallback of a role may lack a car, too, and has a fallback of its own. So repeat until no places are added.
+    # A fallback may lack cars, too, and may have a fallback of its own. So repeat until no places are added.
     while True:
         open_places = {name: min(places[name], counts.get(name, 0)) for name in plan.roles if name in places}
         open_places |= {

@@ -22,8 +22,8 @@ from fleet.policy.plan.plan import (
 from fleet.policy.snapshot import FleetSnapshot
 
 PHASE_SETTLE_TIMEOUT_S: Final = 15.0
-"""Maximum time to wait for a phase's cars before its timeout starts. Recovery and opening take 4.9 + 3.5 s
-(docs/reference/protocol.md#stops)."""
+"""Maximum time to wait for a phase's cars before its timeout starts. The recovery of a car and the opening of a mode
+take 4.9 + 3.5 s (docs/reference/protocol.md#stops)."""
 _ALL_CARS: Final = ""
 """Used in place of a car's name if the condition is about all cars."""
 _NO_CARS: Final[Mapping[str, Debounced]] = MappingProxyType({})
@@ -62,6 +62,7 @@ class CarSets(Struct, frozen=True):
     """Sets of cars to which a rule may apply."""
 
     subjects: tuple[str, ...]
+    """All cars that the plan decides about."""
     free: Collection[str]
     """The cars that can be commanded now."""
     present: Collection[str]
@@ -134,7 +135,7 @@ def _debounce_by_car(
 def _watched_cars(condition: PlanCondition, cars: CarSets, before: Mapping[str, Debounced]) -> list[str]:
     """Return the cars that the condition is about.
 
-    A car that made it true stays, even if the rule gave it a new role.
+    A car that made the condition true stays among them, even if the rule gave the car a new role.
     """
     if condition.car is not None:
         return [condition.car]
@@ -192,7 +193,8 @@ def follow_phase(
 ) -> PhaseState:
     """Return the phase now. Each phase lasts at least HYSTERESIS_S, so that two phases do not alternate quickly.
 
-    `ready` is True if every car is known and in its mode. The phase's timeout starts only then.
+    `ready` is True if every car is known and in its mode. The phase's timeout starts then, or after
+    PHASE_SETTLE_TIMEOUT_S.
     """
     phase = plan.phases.get(before.name)
     if phase is None:

@@ -57,6 +57,7 @@ class PersistedPolicy(Struct, frozen=True):
     phase_since_s: float = 0.0
     """Start of the phase on the wall clock."""
     rules: Mapping[int, str] = field(default_factory=dict)
+    """By position in the plan: the car that triggered the rule. Empty if the condition is about all cars."""
     stopped_by: str = ""
     """Sender who stopped the plan. Empty if the plan runs."""
     to_rest: tuple[str, ...] = ()

@@ -61,7 +61,7 @@ def try_plan(plan: Plan, snapshot: FleetSnapshot, in_force: PlanInForce | None, 
         phase = PhaseState(in_force.phase, begun) if in_force.phase in in_force.plan.phases else PhaseState()
         memory = carry_over(PolicyState(started_at=begun, held_roles=held, phase=phase), in_force.plan, plan)
     decided = step(plan, snapshot, memory, now)
-    # The coordinator also publishes the cars that have no role.
+    # The coordinator also publishes the cars that have no role. Leave them out.
     own = () if in_force is None else in_force.roles.items()
     roles_before = {car: role for car, role in own if in_force is not None and role in in_force.plan.roles}
     cars = tuple(

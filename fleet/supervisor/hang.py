@@ -44,7 +44,7 @@ class Sign(StrEnum):
 
 
 class CpuTime(Struct, frozen=True):
-    """What the system reports about the CPU time of a process since its start."""
+    """The CPU time of a process since its start, as the system reports it."""
 
     run_s: float
     """Time on a CPU."""

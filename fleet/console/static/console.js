@@ -16,7 +16,7 @@ const MAX_RESULTS = 6;
 const DRAWING_SHARE = 3; // the page rests three times as long as a drawing took
 const MAX_DRAWING_MS = 150; // the longest time that counts, so that the page rests 450 ms at most
 const STOPS = ["stop", "estop"]; // also while somebody looks back
-const STOP_RETRY_MS = 10_000; // a stop counts for so long at a gateway
+const STOP_RETRY_MS = 10_000; // the maximum age of a stop when it arrives at a gateway
 
 // A page that is loaded again (phones do that with a page that slept) has the same cars selected. Each tab has its own.
 const SELECTED = "fleet-selected";

@@ -73,7 +73,7 @@ class Faults(Struct, frozen=True):
 def find_faults(
     plan: Plan, cars: Mapping[str, CarSnapshot] | None = None, present: Collection[str] | None = None
 ) -> Faults:
-    """Return the faults of a plan that should be put in force.
+    """Return the faults of a plan before it is put in force.
 
     `cars` has the cars in the fleet file (observer.listed_cars), or is None if there is no fleet file. `present` are
     the cars on the bus, or None if they are not known. Without a fleet file, a car of the plan that is not present is

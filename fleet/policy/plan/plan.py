@@ -132,7 +132,7 @@ class Plan:
     """The mode of cars that have no role. None if the plan leaves them alone."""
     text: str
     places: Mapping[str, tuple[int, int]] = field(default_factory=dict, compare=False)
-    """Line and column of each role, rule, phase and named car in the text, by the name that findings use."""
+    """Line and column of each role, rule, phase and named car in the text, by the name that the lint's findings use."""
 
     @property
     def version(self) -> str:

@@ -28,8 +28,8 @@ Readings compress by a factor of 3 to 20."""
 BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 
 Record = tuple[int, int, int, int, bytes]
-"""A message has channel, sequence, log time, publish time, payload. A channel or schema has minus its opcode, 0, 0, 0,
-body."""
+"""A message is channel, sequence, log time, publish time, payload. A channel or schema is minus its opcode, 0, 0, 0,
+body: a negative first number is no message."""
 
 
 class Damage(Struct, frozen=True):
@@ -78,7 +78,7 @@ class ChunkPart(Struct, frozen=True):
                     raise EndOfFile
                 if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
                     body = data[begin:at]
-                    # Parse it here, too, so that a chunk with one corrupted record yields no message at all.
+                    # Parse the record here, too, so that a chunk with one corrupted record yields no message at all.
                     (Channel if opcode == Opcode.CHANNEL else Schema).read(ReadDataStream(BytesIO(body)))
                     found.append((-opcode, 0, 0, 0, body))
         return found

@@ -56,7 +56,7 @@ class Backfill:
 
     def __init__(self, bus: Bus, expressions: Sequence[str], *, resumes: bool) -> None:
         self._bus = bus
-        # Clients that send command streams have no cache.
+        # Do not ask for command streams: the clients that send them have no cache.
         self._all = tuple(expression for expression in expressions if "@cmd" not in expression)
         self._lock = threading.Lock()
         self._gaps: dict[str, float] = {}

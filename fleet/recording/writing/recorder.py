@@ -1,4 +1,4 @@
-"""Records all messages of one fleet into sessions. The recorder is one more subscriber and has no policy.
+"""Records all messages of one fleet into sessions. The recorder is one more subscriber, and selects nothing.
 
 It runs three threads:
 - The reader drains the subscriptions and never touches a disk. So if the disk hangs, messages are dropped here, but the
