@@ -29,7 +29,10 @@ def environment() -> dict[str, str]:
 
 
 def program() -> Path:
-    """Return the path of Rerun's program. The `rerun` on PATH is a wrapper: without the wrapper the viewer runs on."""
+    """Return the path of Rerun's program.
+
+    The `rerun` on PATH is a wrapper. If the wrapper is ended, the viewer runs on.
+    """
     import rerun_cli  # type: ignore[import-untyped]  # only a wrapper around the program
 
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
