@@ -22,7 +22,7 @@ class BadCapture(ValueError):
 
 
 class CapturedBytes(Struct, frozen=True):
-    """Bytes as they arrived. `at` is in seconds since the start of the capture. The file has microseconds."""
+    """Bytes as they arrived. `at` is in seconds since the start of the capture. The file rounds it to microseconds."""
 
     at: float
     data: bytes

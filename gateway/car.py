@@ -51,11 +51,11 @@ from schemas.running_cars import RunningMark
 from schemas.words import Level, Shows
 
 RIVAL_CHECK_DELAY_S: Final = 0.5
-"""Delay of the second check for another gateway of the car. By then, both must have declared themselves on the bus
+"""Delay of the second check for another gateway of the car. By then, both gateways must be declared on the bus
 (docs/reference/keys.md#one-gateway-per-car)."""
 RIVAL_SHUTDOWN_S: Final = SHUTDOWN_S + 2.0
-"""Maximum time that the remaining gateway waits for the port. The other one must notice the conflict, stop the car and
-close the port."""
+"""Maximum time that the remaining gateway waits for the port. In this time, the gateway that has to end must notice the
+conflict, stop the car and close the port."""
 HEALTH_INTERVAL_S: Final = 1.0
 LEARNED_INTERVAL_S: Final = 10.0
 """Minimum time between two saves of what was learned about the car."""
@@ -166,7 +166,7 @@ class CarGateway:
     async def run(self) -> bool:
         """Serve the car until `stop`, then until the car has stopped. Return False if it could not be stopped.
 
-        Raises AlreadyServed (see bus/service.py), and LinkError if the link cannot be opened at the start.
+        Raises AlreadyServed (see bus/car_service.py), and LinkError if the link cannot be opened at the start.
         """
         now = self._loop.time()
         self._publish_states(now)
@@ -240,7 +240,7 @@ class CarGateway:
         self._wake.set()
 
     def _fail_commands(self) -> None:
-        """Fail all commands, and withdraw all claims. Ignore errors, as the driver itself may have failed."""
+        """Fail all commands, and claim nothing about the car any more. Ignore errors: the driver may have failed."""
         with contextlib.suppress(Exception):
             self._driver.link_down("its gateway failed", self._loop.time())
 
@@ -358,7 +358,10 @@ class CarGateway:
                 self._worst_lag_s = 0.0
 
     def _on_gap(self, now: float) -> None:
-        """Handle a gap of the loop or a sleep: the bus may have been lost, and a driven car must be stopped."""
+        """Handle a time in which the loop did not run (a gap), or in which the computer slept.
+
+        The bus may have been lost meanwhile, and a driven car must be stopped.
+        """
         if (slept_s := self._sleep.take()) > 0:
             self._publisher.on_bus_lost(now)
             if not MONOTONIC_COUNTS_SLEEP:
@@ -382,7 +385,7 @@ class CarGateway:
             log.debug("what was learned about %s could not be saved: %s", self._settings.car, error)
 
     def _publish_states(self, now: float, *, force: bool = False) -> None:
-        """Publish changed states. Publish a new finding about the car before the claims that rest on it."""
+        """Publish changed states. Before them, publish a new finding about the car, because the states rest on it."""
         if findings_of(self._driver.model) != self._published_findings:
             self._publish_health(now)
         self._publisher.publish_states(self._control, self._link.health, now, force=force)

@@ -64,10 +64,10 @@ def main() -> None:
 
 
 class _GatewayParser(argparse.ArgumentParser):
-    """A parser with errors of one line. It exits with 1 if its help cannot be written."""
+    """A parser whose errors take one line. It exits with 1 if its help cannot be written."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse the words. A subcommand rejects words that it does not know, because it can name the likely option."""
+        """Parse the words. The parser of a subcommand rejects unknown words itself, and names the likely option."""
         if self._subparsers is not None:
             return super().parse_known_args(args, namespace)
         for word in args:
@@ -241,7 +241,7 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         with _opened(arguments, car, url, platform, fleet) as opened:
             service = CarService(opened, fleet, car)
-            # The car is on the bus now. The following imports take as long again, so they come after it.
+            # The car is on the bus now. The imports below take as long as the start up to here, so they come last.
             import asyncio
 
             from gateway.car import Settings, begin_logging, serve

@@ -49,10 +49,10 @@ class LinkLoop:
         on_gap: Callable[[float], None],
         log_open: Callable[[], None],
     ) -> None:
-        """Make the loop of a link. `on_gap` is called before bytes are judged, to detect a gap of the asyncio loop.
+        """Make the loop of a link. `on_gap` is called before bytes are decoded, to detect a gap of the asyncio loop.
 
-        `log_open` logs that the link is open. It is called at once, but if the last link was soon lost, only when this
-        one is proven (`Attempts`).
+        `log_open` logs that the link is open. It is called when the link opens. After a link that was lost before it
+        was proven, it is called only when the new link is proven: by a reading, or by its age (see `Attempts`).
         """
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
@@ -128,7 +128,7 @@ class LinkLoop:
             data = await link.read()
             read_at = now = self._loop.time()
             self.health.on_bytes(len(data), now)
-            self._on_gap(now)  # first, because reports that are read late may look like a block gap of the car
+            self._on_gap(now)  # first, because reports that are read late look as if a frame had kept the car busy
             for start in range(0, len(data), SLICE_BYTES):
                 if start:
                     await asyncio.sleep(0)

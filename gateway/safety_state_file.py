@@ -1,7 +1,7 @@
 """Persists the safety state of one car (its hold, e-stops, pauses and loan) in a small JSON file.
 
-A hold, a loan or an e-stop of one car belongs to the car at one link: a simulated red is not the red on the table. So
-the file has them for each link. Pauses and e-stops of the whole fleet do not depend on the link.
+A hold, a loan or an e-stop of one car belongs to the car at one link: the simulated car `red` is not the car `red` on
+the table. So the file has them for each link. Pauses and e-stops of the whole fleet do not depend on the link.
 """
 
 import json
@@ -94,7 +94,7 @@ class SafetyStateFile:
 def _exchanged(
     others: tuple[_OfLink, ...], state: PersistedSafety, *, was: str, now: str
 ) -> tuple[tuple[_OfLink, ...], PersistedSafety]:
-    """Put the state of the previous link (`was`) among the others, and take out that of the new one (`now`)."""
+    """Put the state of the previous link (`was`) among the others, and take out the state of the new link (`now`)."""
     of_car = tuple(each for each in state.estops if not each.fleet_wide)
     of_fleet = tuple(each for each in state.estops if each.fleet_wide)
     mine = next((each for each in others if each.link == now), _OfLink(now, None, (), None))

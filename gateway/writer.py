@@ -29,9 +29,9 @@ class Writer:
     ) -> None:
         """Make the writer of a car. `on_gap` is called before a frame is chosen, to detect a gap of the loop.
 
-        `on_opened_as_changed` is called when `Driver.opened_as` has changed. `notifier` is fed by each turn and each
-        frame, and by nothing else. So if no frame can be written any more, systemd starts another gateway, which stops
-        the car.
+        `on_opened_as_changed` is called when `Driver.opened_as` has changed. `notifier` tells systemd after each turn
+        and each frame that the gateway works, and at no other time. So if no frame can be written any more, systemd
+        starts another gateway, which stops the car.
         """
         self._loop = asyncio.get_running_loop()
         self._driver = driver
@@ -58,10 +58,10 @@ class Writer:
     async def _write_due(self) -> None:
         """Write the frames that are due."""
         now = self._loop.time()
-        self._on_gap(now)  # first, because reports that are decoded late may look like a block gap of the car
+        self._on_gap(now)  # first, because reports that are decoded late look as if a frame had kept the car busy
         self._link.on_events(self._driver.flush(now))
         while (link := self._link.link) is not None and (write := self._next_frame()) is not None:
-            self._driver.sends(write.data, self._loop.time())  # an echo may arrive before the write returns
+            self._driver.sends(write.data, self._loop.time())  # the car may repeat the bytes before the write returns
             try:
                 await link.write(write.data)
             except LinkLost as error:

@@ -351,7 +351,7 @@ def _fill_mode(message: pb.Mode, control: Controller[Driver], now: float) -> Non
 
 
 def findings_of(model: DriverClaims) -> tuple[object, ...]:
-    """Return the findings about the car itself: its profile, and whether it shows its stops."""
+    """Return the findings about the car itself: its profile, and whether its readings show its stops."""
     return model.profile.name, model.shows, model.doubted
 
 

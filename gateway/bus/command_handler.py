@@ -1,6 +1,6 @@
 """Handles the command queries and drive streams of one car: parses them, records them, answers them.
 
-Control decides about each command. Its answer is sent after the writer has had a turn and the safety state is saved.
+Control decides about each command. The answer is sent after the writer has had a turn and the safety state is saved.
 """
 
 import logging
@@ -36,7 +36,7 @@ command_log = logging.getLogger(json_log.COMMANDS)
 
 
 class CommandHandler:
-    """The commands of one car. It runs in the loop. `clock` is the loop's clock, and `wake` wakes the writer.
+    """Handles the commands of one car, in the loop. `clock` is the loop's clock, and `wake` wakes the writer.
 
     `on_gap` looks for a gap of the loop: after a sleep of the computer, the car is stopped before the next command.
     """
@@ -86,7 +86,7 @@ class CommandHandler:
     def _share(self, request: Request, command: Command, answer: Answer, before: PersistedSafety) -> None:
         """Forward a command that concerns the whole fleet to the other gateways.
 
-        If the command was sent to them too, query them instead: this gateway may have missed something before.
+        If its sender has addressed them too, by a wildcard, query them instead.
         """
         if not request.by_wildcard:
             self._estop_sync.forward(command, before, self._control.safety.persisted)

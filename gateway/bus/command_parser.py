@@ -1,6 +1,6 @@
 """Parses a command query or publication into a `Command`, or raises an error that names the mistake.
 
-It checks ranges. `gateway.control.refusals` decides whether the command may be carried out now.
+The parser also checks ranges. `gateway.control.refusals` decides whether the command may be carried out now.
 """
 
 import hashlib
@@ -55,7 +55,7 @@ MAX_NAME_LENGTH: Final = 128
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Maximum time in which one query reaches all gateways."""
 _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
-"""The kinds that a command may claim."""
+"""The kinds of sender that a command may name. Only the fleet file says which person is a lead."""
 # One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
 WILDCARD_VERBS: Final = tuple(verb for verb, row in COMMANDS.items() if row.wildcard)
 
@@ -99,16 +99,16 @@ def parse(
 
 
 def _proven(command: Command, identity: str) -> Command:
-    """Return the command if its identity may speak for its sender, else raise BadRequest.
+    """Return the command if `identity`, which a certificate proves, may speak for its sender, else raise BadRequest.
 
-    A stop is always returned, in the name of the certificate's owner.
+    A stop in the name of somebody else is returned, too, but in the name of the certificate's owner.
     """
     sender = command.sender
     if not identity or speaks_for(identity, sender.name, sender.kind, command.verb):
         return command
     words = f"{identity} sent it in the name of {sender.name} ({sender.kind})"
     own = Sender(identity.partition(".")[2] or identity)
-    if command.verb in STOPS:  # the car stops for everybody, but its hold must not have a false name
+    if command.verb in STOPS:  # the car stops for everybody, but its hold must not name a false sender
         return replace(command, sender=own, note=f"the gateway stops the car in spite of an error: {words}")
     words = f"{command.verb}: {words}. Each certificate speaks for its owner only."
     raise BadRequest(Reason.NOT_ALLOWED, words, replace(command, sender=own))

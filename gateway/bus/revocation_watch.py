@@ -1,7 +1,8 @@
 """Notices that the hub no longer passes on messages of this gateway, so that nobody can command or stop its car.
 
-The rules of a hub change only with a restart of the hub, so it is enough to look after each new link to a hub. A hub
-that has just started passes messages on late, and a network may lose them. So one look without a result proves nothing.
+The rules of a hub change only with a restart of the hub. So it is enough to look, after each new link to a hub, whether
+the hub passes on the gateway's own token. A hub that has just started passes messages on late, and a network may lose
+them. So one look that does not find the token proves nothing.
 """
 
 import asyncio
@@ -19,7 +20,7 @@ LOOKS: Final = 3
 
 
 class LinkChecks:
-    """Decides when to look, and when silence means that the certificate was revoked. Pure."""
+    """Decides when to look for the token, and when its absence means that the certificate was revoked. Pure."""
 
     def __init__(self) -> None:
         self._checked: tuple[str, ...] = ()

@@ -3,7 +3,7 @@
 A message over the budget costs one callback, but no copy and no turn of the loop. For that, the sender must be known
 before the message is read. On a bus with certificates, each drive of a stream has its sender's identity in its key, so
 all sessions of one identity share a budget. On a bus without certificates, the sender is the Zenoh session that
-published the message. Messages that name neither share one budget.
+published the message. Messages without an identity and without a session share one budget.
 
 Without budgets, Zenoh's queue for the callback fills up. Then Zenoh reads nothing from the hub, and a stop waits there.
 The budget is ten times what a joystick sends.

@@ -20,11 +20,12 @@ CHARGE_ERROR: Final = 0.15
 HYSTERESIS_V: Final = 0.15
 """How far the voltage must rise above a threshold to end the lower level."""
 LEVEL_DEBOUNCE_S: Final = 5.0
-"""Time for which all readings must show another level before the level changes. In mode 0 there is one a second."""
+"""Time for which all readings must show another level before the level changes. In mode 0 a reading comes each
+second."""
 
 
 class BatteryPolicy(Struct, frozen=True):
-    """The threshold of each level (V at rest, for two cells), and the reaction to each level.
+    """The threshold of each level (V at rest, that is without a load, for two cells), and the reaction to each level.
 
     By default no level stops the car. If the voltage gets too low, the car resets, which stops it too.
     """
@@ -68,8 +69,8 @@ class Battery(Struct):
     _loaded_at: float = float("-inf")
     _other: BatteryLevel | None = None
     _since: float = 0.0
-    """`_other` is the level that the readings show instead of `level`. Since `_since`, they have all been on that
-    side of `level`."""
+    """`_other` is the level that the readings show instead of `level`. Since `_since`, all readings have been on the
+    same side of `level`: all worse, or all better."""
 
     def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
         """Update the level with a measured voltage. Return True if it has changed. With `loaded`, motors may be on."""
@@ -84,7 +85,7 @@ class Battery(Struct):
             self.level = BatteryLevel.OK
         shown = self.level
         if _LEVEL_RANK[worse] > _LEVEL_RANK[shown]:
-            shown = worse  # even with the maximum drop by a load
+            shown = worse  # the level is worse even if a load causes the maximum drop
         elif _LEVEL_RANK[better] < _LEVEL_RANK[shown]:
             shown = better
         if shown is self.level:

@@ -27,7 +27,7 @@ class Pending(Struct):
     due_at: float = float("-inf")
     """When the next frame is due, at the end of the delay before it."""
     part: Hashable = None
-    """The part of the car that it acts on, as its driver names it."""
+    """The part of the car that the command acts on, as the driver names it."""
 
     @property
     def waits_since(self) -> float:
@@ -41,7 +41,7 @@ class Pending(Struct):
 
     @property
     def is_delayed(self) -> bool:
-        """Return True if there is a delay before its next frame. Other commands need not wait for this one."""
+        """Return True if there is a delay before the next frame. Other commands need not wait for this one."""
         return bool(self.frames) and isinstance(self.frames[0], Later)
 
     @property

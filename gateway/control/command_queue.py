@@ -30,7 +30,7 @@ class HeldMotion(Struct):
     began_at: float | None = None
     """When the frame of the drive was written, or None if the drive still waits."""
     range_cm: float | None = None
-    """The distance before that frame was written, if it is known."""
+    """The last measured distance before that frame was written, cm. None if it is not known."""
 
     @property
     def sender(self) -> Sender:

@@ -21,7 +21,8 @@ class CommandRecord(Struct, frozen=True):
     evidence: tuple[str, ...] = ()
     count: int = 1
     basis: str = ""
-    """`shown` or `sent`, in the last record of a stop."""
+    """In the last record of a stop: `shown` if readings show the stop, `sent` if only its frames were written. In the
+    last record of a drive: `sent`."""
 
 
 class LogRecord(Struct, frozen=True):

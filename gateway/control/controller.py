@@ -43,8 +43,8 @@ from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason,
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
-"""Margin for a drive that waits for the car. The drive expires after the announced wait or its own duration, whichever
-is longer, and this margin."""
+"""Margin for a drive that waits for the car. If its frame is not written, the drive expires after the announced wait or
+its own duration, whichever is longer, plus this margin."""
 
 
 class Controller(Generic[D_co]):
@@ -85,7 +85,7 @@ class Controller(Generic[D_co]):
 
     @property
     def owner(self) -> str:
-        """Return the sender of the held motion, or an empty text if none is held."""
+        """Return the sender of the held motion (the drive in progress), or an empty text if none is held."""
         return self._queue.held.sender.name if self._queue.held else ""
 
     def expires_in_s(self, now: float) -> float | None:

@@ -49,14 +49,15 @@ STALL_S: Final = 0.5
 LATE_DRIVE_S: Final = 0.1
 """A drive may begin this long after its request. If it begins later, its sender is told how long it waited."""
 MOVED_CM: Final = 5.0
-"""Minimum change of the distance that counts as a movement. At rest, readings differ by up to a centimeter."""
+"""Minimum change of the measured distance that counts as a movement. While a car stands, its readings differ by up to a
+centimeter."""
 
 
 # ---------------------------------------------------------------------- bytes of a car
 
 
 class Event(Protocol):
-    """An item that a decoder found in the bytes: a reading, an echo, or bytes that are neither."""
+    """An item that a decoder found in the bytes: a reading, an `Echo` of our own frame, or bytes that are neither."""
 
     @property
     def raw(self) -> bytes:
@@ -86,7 +87,7 @@ class Rejected(Struct, frozen=True):
 class TextLine(Struct, frozen=True):
     """A whole line of text between frames, such as a debug print, with its line end. It does not count as damage.
 
-    It may be in a longer run of unreadable bytes. `at` is the time of the last byte of that run.
+    The line may be in a longer run of unreadable bytes. `at` is the time of the last byte of that run.
     """
 
     raw: bytes
@@ -174,11 +175,11 @@ class DriverClaims(Protocol):
 
     @property
     def known(self) -> bool:
-        """True if nothing is in doubt since the first stop of the car, so that it reads frames as they are meant."""
+        """True if the first stop is over, and no doubt has arisen since, so that the car reads frames as meant."""
 
     @property
     def at_rest(self) -> bool:
-        """True if the car stands still in mode 0 after a stop. The basis may be `shown` or only `sent`."""
+        """True if the car stands still in mode 0 after a stop, which its readings may show or not (see `basis`)."""
 
     @property
     def is_heard(self) -> bool:
@@ -363,7 +364,7 @@ class Driver(ABC):
 
     def stop_after_sleep(self, now: float) -> None:
         """Stop the car. A stop that began before the sleep continues."""
-        if not self.shutting_down or self.is_stopping:  # nothing follows the last stop of a gateway that ends
+        if not self.shutting_down or self.is_stopping:  # after its last stop, a gateway that ends sends nothing
             self.stop(FrameOrigin.STOP, now)
 
     # ------------------------------------------------------------------ frames out
@@ -500,9 +501,10 @@ class Driver(ABC):
             self.stop_if_open(now)
 
     def halt(self, words: str, now: float, by: str = "") -> None:
-        """Drop all commands, and refuse each sender that has just driven until it has been silent. Shorten the lease.
+        """Drop all commands, and shorten the lease. Refuse the drives of each sender that has just driven.
 
-        `by` is the sender of the stop. It is refused only if it streams: a script may stop and drive again.
+        Such a sender is refused until it has sent no drive for some time. `by` is the sender of the stop. It is refused
+        only if it streams: a script may stop and drive again.
         """
         self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self.safety.shorten_lease(now)
@@ -542,7 +544,7 @@ class Driver(ABC):
         """End the commands whose time is over."""
         held, car = self.queue.held, self.desk.car
         if held is not None and now >= self.queue.held_until:
-            if now < held.expires_at:  # it has time left, but its sender is gone
+            if now < held.expires_at:  # the drive has time left, but its sender is gone
                 self.safety.mark_holder(held.sender.name, connected=False)
                 self.release(Phase.EXPIRED, Reason.EXPIRED, f"its sender {held.sender.text_name} disconnected", now)
             elif held.pending.sent:
@@ -551,7 +553,7 @@ class Driver(ABC):
                     waited_s = held.began_at - held.pending.received_at
                     words = f"began after {waited_s:.1f} s: {car} was busy"
                 self.release(Phase.COMPLETE, None, words, now)
-            else:  # its frame could not be written in all that time
+            else:  # the frame of the drive could not be written in all that time
                 waited_s = now - held.pending.received_at
                 self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy for {waited_s:.1f} s", now)
         self.queue.expire(now)

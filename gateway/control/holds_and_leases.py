@@ -100,7 +100,7 @@ class Safety(Struct):
             self.lease = None
 
     def latch(self, estop: Estop) -> Estop:
-        """Latch an e-stop and put the car on hold. An e-stop whose id has already ended gets a new id.
+        """Latch an e-stop (put it in force), and put the car on hold. An e-stop whose id has ended gets a new id.
 
         If too many e-stops are in force, do not latch this one. The car stays stopped anyway, until all of those are
         released.

@@ -76,8 +76,8 @@ class LinkHealth(Struct):
         """Update the state. Return True on a change.
 
         `limit_s` is the longest normal silence, or None if every silence is normal. `unheard_s` is the time without a
-        reading, less the time for which our frames block the car (see `ModeEstimator`). `is_heard` is False if the
-        driver counts the car as silent.
+        reading, less the time in which our frames keep the car too busy to report (see `ModeEstimator`). `is_heard` is
+        False if the driver counts the car as silent.
         """
         if self.state is LinkState.LOST:
             return False

@@ -176,7 +176,7 @@ def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal 
 
 
 def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal | None:
-    """Return the first need that is not met, or None if all are."""
+    """Return the refusal for the first need that is not met, or None if all needs are met."""
     car, right = context.car, needed.right
     if right is not None:
         if right is Right.MOVE and command.take:

@@ -63,7 +63,10 @@ class Senders(Struct):
         return name not in self._halted
 
     def halt_streams(self, now: float) -> None:
-        """Refuse each stream until it was silent, so that a joystick held before a loss cannot drive afterwards."""
+        """Refuse each stream until it was silent.
+
+        So a joystick that was held before the car was lost cannot drive the car when it is back.
+        """
         self._halted.update(
             name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_SILENCE_S
         )

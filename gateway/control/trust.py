@@ -19,8 +19,8 @@ ends it, and then the car is stopped first. `UNKNOWN` is the time without a link
 count.
 
 Time alone never changes the state. A timeout is an event (`SILENT`, `NOT_SHOWN`), which other modules raise because
-they know the rhythm of this car; here it is one more row of a table. `TRANSITIONS` has a next state for every state and
-event, so no combination is forgotten, and a test walks through all of them.
+they know the usual interval between the reports of this car. Here, a timeout is one more row of a table. `TRANSITIONS`
+has a next state for every state and event, so no combination is forgotten, and a test walks through all of them.
 """
 
 from enum import StrEnum
