@@ -161,7 +161,7 @@ def _load(module: str) -> Family:
 
 @cache
 def _installed() -> tuple[tuple[str, Family], ...]:
-    # Import it only here: reading the metadata of all installed packages takes some 10 ms, and few cars need it.
+    # Import this module only here: to read the metadata of all packages takes some 10 ms, and few cars need that.
     from importlib.metadata import entry_points
 
     found = []

@@ -122,7 +122,7 @@ ANSWERS: Final[Mapping[str, tuple[type, ...]]] = {
     "accepts_commands": (bool,),
     "wait_words": (str,),
 }
-"""The types of what a driver answers at any time. Methods from `next_at` on have the time as an argument."""
+"""The types of what a driver answers at any time. The methods from `next_at` to the last one take the time."""
 FINDINGS: Final = ("silent", "not_obeyed", "range")
 """Some of what `fleet doctor` asks `CarProfile.hint` about: two findings, and a field."""
 HOSTILE: Final = (
@@ -248,7 +248,7 @@ def check_names(family: Family, platform: str) -> Iterator[str]:
 
 
 def check_profile(family: Family, platform: str) -> Iterator[str]:
-    """Check a profile: its types and words, that it is equal for the same name, and what it measures and lacks."""
+    """Check a profile: its types and words, that one name has equal profiles, and what the car measures and lacks."""
     profile = family.profile_of(platform)
     for field, types in PROFILE_TYPES.items():
         value: Any = getattr(profile, field)
@@ -425,8 +425,8 @@ def check_hostile(family: Family, platform: str) -> Iterator[str]:
 def check_rest(family: Family, platform: str) -> Iterator[str]:
     """Check that a moving car never counts as having shown its stop.
 
-    `MOVING` of the module has bytes of a car that moves. If `SAMPLES` show a stop, `MOVING` is required, because
-    perhaps any report of the car would count as one that shows a stop.
+    `MOVING` of the module has bytes of a car that moves. If `SAMPLES` show a stop, `MOVING` is required. Without it,
+    any report of the car might count as one that shows a stop.
     """
     standing = _connected(family, platform, _samples(family))
     standing.ask(Stop())
@@ -459,7 +459,7 @@ def check_stop(family: Family, platform: str) -> Iterator[str]:
         stop = bench.ask(Stop())
         bench.run(30.0)
         announced_s = max((each.worst_case_s for each in bench.records if each.command.id == stop), default=0.0)
-        # The stop may have joined one that is still going on. Then the frames of that one count.
+        # The stop may have joined an earlier one that is still going on. Then the frames of the earlier stop count.
         from_s, until_s = asked_at - JOINED_S, asked_at + max(FIRST_STOP_S, announced_s)
         if not any(at <= until_s for at in bench.stop_frames(from_s)):
             limit_s = until_s - asked_at
@@ -627,7 +627,7 @@ def _samples(family: Family) -> Sequence[bytes]:
 
 
 def _is(value: object, *kinds: type) -> bool:
-    """Return True for a value of these types. The driver may return others than it declares."""
+    """Return True for a value of these types. The driver may return other types than it declares."""
     return isinstance(value, kinds)
 
 

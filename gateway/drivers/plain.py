@@ -1,4 +1,4 @@
-"""The base class of simple drivers, for families of cars that need no theory of their own. Pure.
+"""The base class of simple drivers, for families of cars whose state need not be estimated. Pure.
 
 Such a car continues a motion until it gets another one, or until its dead-man timer stops it. Its stop is one sequence
 of frames. It has no modes. A family defines its frames, and what its readings show, with class attributes and a few
@@ -9,8 +9,8 @@ whose readings show more calls `show_rest`; then the stop ends as `shown`. If it
 but do not in time, the stop counts as not confirmed, and the driver continues to send it.
 
 *Safe motions.* If a car has a dead-man timer, a held motion is sent again well before that time is over. So one lost
-frame does not stop the car, but a lost link does. If it has none, a stop that no reading shows is sent again every few
-seconds, because its frames may have been lost.
+frame does not stop the car, but a lost link does. If a car has no such timer, a stop that no reading shows is sent
+again every few seconds, because its frames may have been lost.
 """
 
 from abc import abstractmethod
@@ -57,8 +57,8 @@ from schemas.words import (
 )
 
 RENEWAL_S: Final = 6.0
-"""Interval at which a stop that nothing shows is repeated, if the car has no dead-man timer. The first family has the
-same interval."""
+"""Interval at which a stop that no reading shows is repeated, if the car has no dead-man timer. The yahboom family has
+the same interval."""
 SPEED_STEP: Final = 0.1
 """One step of the speed, a share of full speed."""
 _STEPS: Final[Mapping[SpeedStep, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}
@@ -94,7 +94,7 @@ class PlainModel(Struct):
     range_cm: float | None = None
     range_at: float = float("-inf")
     turned_at: float = float("-inf")
-    """When a reading last showed that its wheels turned. Stays -inf if wheels are not measured."""
+    """When a reading last showed that the wheels turned. Stays -inf if wheels are not measured."""
     sent_motion: Motion = Motion.STOP
     """The motion whose frame was written last."""
     speed: float = 0.5
@@ -163,7 +163,7 @@ class PlainModel(Struct):
 
 
 class PlainStop(Struct):
-    """A stop in progress. Times: s, monotonic."""
+    """A stop in progress. Its frames are sent in one try after another until it is over. Times: s, monotonic."""
 
     why: FrameOrigin
     began_at: float
@@ -171,6 +171,7 @@ class PlainStop(Struct):
     """When the next frame of the stop, or its next try, is due."""
     commands: list[Pending]
     is_soft: bool
+    """True for the stop at the end of a drive: after its first frame, a new command may replace it."""
     index: int = 0
     """Number of this try's frames that are written."""
     last_at: float = float("-inf")
@@ -621,7 +622,7 @@ class PlainDriver(Driver):
         self._log.log(Level.ERROR, "not_shown", words, now)
 
     def worst_s(self, now: float) -> float:
-        """Return the longest time until the motors are off, if a stop is requested now and its frames arrive."""
+        """Return the longest time until the motors are off, s, if a stop is requested now and its frames arrive."""
         stop = self._stop
         if stop is not None and stop.last_at > float("-inf"):
             return max(0.0, self._gives_way_at(stop) - now)

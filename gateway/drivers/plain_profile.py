@@ -26,7 +26,7 @@ class PlainProfile(Struct, frozen=True):
     not_observed: tuple[str, ...] = ()
     """Facts that were read or assumed, but not seen on a car, as sentences."""
     has_network: bool = True
-    """True if a TCP port is the car's own. False if it belongs to a bridge. Then `fleet check` may connect to it."""
+    """True if a TCP port is the car's own. False if it belongs to a bridge: `fleet check` may connect to a bridge."""
     hints: tuple[tuple[str, str], ...] = ()
     """The likely cause of a finding of `fleet doctor` (`silent`, `not_obeyed`) in such cars, as a sentence for each."""
     modes: frozenset[Mode] = frozenset({Mode.MANUAL})

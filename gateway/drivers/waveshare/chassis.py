@@ -22,8 +22,9 @@ class Chassis(Struct, frozen=True):
     main: int
     """The number of the chassis in the command `T:900`, which sets wheels, direction and the kind of speed control."""
     has_encoders: bool
-    """True if the car controls its speed with encoders: commands are in m/s, and its `L` and `R` are measured. False if
-    a command is a share of full power (0.5 is full), and its `L` and `R` are nothing or repeat the command."""
+    """True if the car controls its speed with encoders: commands are in m/s, and the reported `L` and `R` are measured.
+    False if a command is a share of full power (0.5 is full). Then the reports have no `L` and `R`, or those of the
+    command."""
 
 
 PLATFORMS: Final[dict[str, dict[UgvFirmware, Chassis]]] = {

@@ -1,7 +1,7 @@
 """Drives one car of Waveshare's UGV family. Pure.
 
 These cars accept JSON, one object per line, over a UART. They acknowledge nothing by themselves, but have two things
-that the first family lacks: a dead-man timer, and on some chassis encoders. This essay says what can rest on these two.
+that the yahboom family lacks: a dead-man timer, and on some chassis encoders. This text says how the driver uses them.
 
 *One number, three meanings.* `{"T":1,"L":0.4,"R":0.4}` is 0.4 m/s on a chassis with encoders, four fifths of full power
 on one without, and nearly nothing on the factory's first program. The command looks the same for all three. So no
@@ -11,15 +11,16 @@ of feedback, the car may not be driven until its set-up is repeated.
 
 *The dead-man timer.* Three seconds after the last `T:1` the motors stop. But on one firmware, `T:13` drives without
 this timer, so that nothing ever stops the car, and `T:136` with a negative number turns the timer off. So we drive only
-with `T:1`, set the timer to one second, and send a held motion four times in that time. Its numbers are limited first:
-beyond 2.0, the car ignores them, but the line still resets the timer. Only the commands of `ALLOWED` are ever written.
+with `T:1`, set the timer to one second, and send a held motion four times in that time. The speeds in it are limited
+first: beyond 2.0, the car ignores them, but the line still resets the timer. Only the commands of `ALLOWED` are ever
+written.
 
 *Evidence of a stop.* If asked to (`T:143`), the car repeats each line that it could parse. That does not prove that it
 obeys. But it gives our readings an order: a feedback that arrives after the repeated stop was made after the stop. If
 its wheel speeds are measured, and are zero from then on for a quarter of a second, the car stands still. Measured means
 three things: the chassis has encoders, we have configured the car, and both wheels were seen to turn in a drive of ours
-since then, as an encoder with a loose wire reports zero for ever. Any other stop ends as `sent`, and we rely on the
-timer.
+since then, as an encoder with a loose wire reports zero for ever. Any other stop ends as `sent`, which claims only that
+its frames were written, and we rely on the timer.
 
 *Lost settings.* We would not notice a setting that was lost on the link. So the chassis and the dead-man time are sent
 until the car has repeated them. A car that repeats no line gets them three times if its feedback arrives at the
@@ -29,10 +30,10 @@ interval that we asked for, else ten times. Then it may be driven, although it c
 it. So after the link is open we listen before we write, and wait for the end of a boot. Only a person's stop does not
 wait.
 
-*Other programs.* The car has a web page with a known password, and accepts commands by radio. Both reset the dead-man
-timer. So if wheels turn while our last command is a stop, that is logged, and the car is stopped. Without encoders no
-reading shows that. But an open web page sends queries, and the car prints the answers here, too. So an open page is
-logged on every car.
+*Other programs.* The car has a web page with a known password, and accepts commands by radio. Commands of either kind
+reset the dead-man timer. So if wheels turn while our last command is a stop, that is logged, and the car is stopped. No
+reading of a car without encoders shows that. But an open web page sends queries, and the car prints the answers on our
+link, too. So an open page is logged on every car.
 """
 
 import json
@@ -68,7 +69,7 @@ ALLOWED: Final = frozenset({DRIVE, PWM, POLL, STREAM, OUTPUTS, DEAD_MAN, STREAM_
 DEAD_MAN_MS: Final = 1000
 """The dead-man time that a gateway sets: four times `RESEND_S`."""
 STREAM_MS: Final = 200
-"""Interval of the feedback. Each has 150 bytes, so that even a bridge of 9600 baud is fast enough."""
+"""Interval of the feedback. One feedback has 150 bytes, so even a bridge of 9600 baud is fast enough."""
 LISTEN_S: Final = 0.5
 """Time after the opening of a link before we write. A car that resets when it is opened begins to print earlier."""
 LISTEN_MAX_S: Final = 30.0
@@ -86,7 +87,8 @@ BLIND_TRIES: Final = 10
 """How often the settings are sent to a car that repeats no line. SILENT_TRIES counts if its feedback comes at the
 interval that we set, because that shows that our lines arrive. Otherwise BLIND_TRIES counts."""
 ECHO_TRIES: Final = 3
-"""Number of tries of a stop without an echo after which the car's echo counts as switched off."""
+"""Number of tries of a stop without an echo (a line of ours that the car repeats). After them, the echo counts as
+switched off."""
 STANDS_S: Final = 0.25
 STANDS_REPORTS: Final = 3
 """Time, and number of feedbacks, for which the wheels must stand still to show a stop: two turns of the speed loop."""
@@ -95,7 +97,7 @@ TURNS_M_S: Final = 0.02
 UNASKED_REPORTS: Final = 3
 """Number of feedbacks in a row with turning wheels that count as a motion which nobody here commanded."""
 UNASKED_LOG_S: Final = 30.0
-"""Minimum time between two log records about a motion that nobody commanded. The car is also stopped in between."""
+"""Minimum time between two log records about a motion that nobody commanded. The car is stopped each time."""
 ON_ITS_WAY_S: Final = 2.0
 """Maximum time that a line of ours takes to reach the car over a slow link."""
 STUCK_S: Final = 1.0
@@ -176,7 +178,7 @@ class WaveshareDriver(PlainDriver):
         self._nameless = 0
         """Number of feedbacks that fit no known firmware."""
         self._rest_odometer_m: tuple[float, float] | None = None
-        """The distance of the wheels when they were first seen to stand still."""
+        """The distance that the wheels had covered, m, when they were first seen to stand still."""
         self._frames: deque[bytes] = deque()
         self._unsure: list[bytes] = []
         """The settings that the car has not repeated yet."""
@@ -234,7 +236,7 @@ class WaveshareDriver(PlainDriver):
         if event.voltage_v is not None and self._is_new_voltage(event.voltage_v, event.at):
             topics["sensor/battery"] = {"voltage_v": event.voltage_v}
         if self._setup is not Setup.READY or self._here is None:
-            return topics  # before that, an angle may be the position of an arm, and the chassis may be another one
+            return topics  # before the set-up, an angle may be that of an arm, and the chassis may be another one
         if event.odometer_m is not None:
             topics["sensor/odometer"] = dict(zip(("left_m", "right_m"), event.odometer_m, strict=True))
         if event.attitude_rad is not None:
@@ -254,7 +256,7 @@ class WaveshareDriver(PlainDriver):
 
     @property
     def _here(self) -> Chassis | None:
-        """The chassis with the firmware that the car has shown, or None if this platform has none with it."""
+        """The chassis with the firmware that the car has shown. None if none is shown, or if the platform lacks it."""
         return None if self._firmware is None else self._chassis.get(self._firmware)
 
     @property
@@ -315,7 +317,7 @@ class WaveshareDriver(PlainDriver):
             self._on_firmware(event.firmware, now)
         if self._firmware is None:
             self._on_nameless(event, now)
-        if self._booting and self._setup is Setup.LISTEN:  # a feedback shows that its loop runs, so the boot is over
+        if self._booting and self._setup is Setup.LISTEN:  # a feedback shows that the car's loop runs: the boot is over
             self._booting, self._setup_at = False, now
         self._say_what_it_shows()
         self._was_heard = True
@@ -485,7 +487,7 @@ class WaveshareDriver(PlainDriver):
             self._unsure = [line(CHASSIS, main=here.main, module=0), line(DEAD_MAN, cmd=DEAD_MAN_MS)]
             self._queue_settings()
         if self._frames:
-            # After the last one, leave time for its echo.
+            # After the last frame, leave time for its echo.
             self._setup_at = now + (SETUP_GAP_S if len(self._frames) > 1 else CONFIRM_S)
             return self._frames.popleft()
         self._tries += self._was_heard
@@ -532,7 +534,7 @@ class WaveshareDriver(PlainDriver):
         super()._begin(why, now, commands, is_soft=is_soft)
 
     def stop_frame(self, index: int) -> bytes:
-        """Return a line of a stop: twice power zero, then speed zero. The number marks its echo.
+        """Return a line of a stop: two set the power to zero, the last one the speed. A number marks each line's echo.
 
         The speed loop has an integral, which it keeps while power is set directly, and drops when the wheels stand
         still. If the speed were set at once, the loop would continue with the old integral. So the speed is set last.

@@ -269,7 +269,10 @@ class CarModel:
         return max(self.pacing.flight_until, self.mode_left_by)
 
     def is_awake(self, now: float) -> bool:
-        """Return True if the car reads a frame at once, because no block, known or only possible, is running."""
+        """Return True if the car reads a frame at once, because it is in no block, neither a known nor a possible one.
+
+        In a block, the program of the car is busy, and reads nothing.
+        """
         pacing = self.pacing
         if now <= pacing.awake_until and now >= pacing.earliest_block_end - FLIGHT_S / 2:
             return True

@@ -61,7 +61,7 @@ class CarMonitor:
             model.treat_as(model.platform.profile)
 
     def link_down(self) -> None:
-        """Forget the remembered platform, if the car was silent after a frame that only this platform understands."""
+        """Forget the remembered platform, if the car was silent after a frame that only that platform understands."""
         model = self.model
         is_silent = model.mode_closed_at > model.link_since > model.mode.heard_at
         if model.platform.is_remembered and is_silent:
@@ -139,7 +139,10 @@ class CarMonitor:
             self._log.log(Level.INFO, "hears", f"{name} reacts to MODE00 again", now)
 
     def _on_changed_expectation(self, now: float) -> None:
-        """Log that this car cannot show its stops, or that it runs another program. If it does, drop old claims."""
+        """Log that this car cannot show its stops, or that it runs another program.
+
+        In the second case, drop the claims that rest on readings of the first program.
+        """
         name, learned = self.model.name, self.model.learned
         if learned.shows is Shows.NO:
             words = cases.NO_REACTION.why(name)
@@ -178,7 +181,7 @@ class CarMonitor:
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
         if model.platform.auto:  # else a contradiction has reported the corrected platform
             self._log.log(Level.INFO, "platform_settled", words, now)
-        if has_other_head and self._is_idle:  # the frames of a drive have no head: let it go on
+        if has_other_head and self._is_idle:  # the frames of a drive have no head, so let a drive go on
             self._stops.recover(now, words)
         elif before not in (Platform.UNKNOWN, model.profile.kind):
             self._on_other_program(now, words)

@@ -29,10 +29,9 @@ FREE_ACTIONS: Final = 3
 """Number of actions on parts of the car that are written at once. In a stream of more, the next ones may have to
 wait."""
 LISTEN_LIMITS: Final = 2.0
-"""After a time without a report, a stream of actions waits for one. That time is this many times the silence that
-contradicts the mode."""
+"""A stream of actions waits for a report if none has come for this many times the silence that contradicts the mode."""
 NOTICE_S: Final = 2 * TICK_S
-"""Maximum time within which a silence is noticed: the ticks of a busy gateway come late."""
+"""Maximum time until a silence is noticed: two ticks, because the ticks of a busy gateway come late."""
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Time before the end of a drive in which its motion is not repeated. An stm32 car needs 43 ms to send a
 report. If the repeated motion and the stop after it arrive in that time, the car loses the stop."""
@@ -98,8 +97,8 @@ class Executor(Driver):
             return True
         if self.stops.shutting_down:
             return False
-        # A soft stop may be replaced after its first frame, because the frame of any command ends the old motion just
-        # as the second frame would.
+        # A soft stop (at the end of a drive) may be replaced after its first frame, because the frame of any command
+        # ends the old motion just as the second frame would.
         is_soft = running.sequence.rank == SOFT.rank and running.index > 0
         return is_soft or now >= running.gives_way_at
 
@@ -156,8 +155,9 @@ class Executor(Driver):
 
     def _act_at(self, pending: Pending) -> float:
         """Return the earliest time for the next frame of an action on a part of the car."""
-        # Without an echo, the car reads only once in a ranging. If it reads while this frame arrives behind an unread
-        # one, it takes the rest of this frame for the next string, and a digit in it may start the motors.
+        # Without a sonar echo, the car reads its buffer only once in each ranging (measurement of the distance), which
+        # then takes long. If it reads while this frame arrives behind an unread one, it takes the rest of this frame
+        # for the next string, and a digit in it may start the motors.
         pacing = self.model.pacing
         follows_action = bool(self._action_times) and self._action_times[-1] == pacing.written_at
         return pacing.act_at(pending.next_frame, alone=follows_action and self.model.is_without_echo)
@@ -379,9 +379,9 @@ class Executor(Driver):
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:
-        """Withdraw the claim that the car has shown its rest, because it may read half of a named frame as a motion.
+        """Claim no longer that the car has shown its rest, because it may read half of a named frame as a motion.
 
-        See docs/reference/protocol.md#hazards.
+        A named frame has words, such as `$4WD,PTZ90#` (docs/reference/protocol.md#hazards).
         """
         self.model.rest_case = cases.ACTED
         words = cases.ACTED.why(self.model.name)
@@ -434,7 +434,7 @@ class Executor(Driver):
             self._log.record(other, Phase.SUPERSEDED, now, reason=Reason.SUPERSEDED, words=words)
 
     def worst_s(self, now: float) -> float:
-        """Return the longest time until the motors are off, if a stop is requested now and its frames arrive."""
+        """Return the longest time until the motors are off, s, if a stop is requested now and its frames arrive."""
         return self.stops.worst_s(now)
 
     def free_at(self, now: float) -> float:

@@ -35,7 +35,7 @@ FLIGHT_S: Final = 0.06
 """Minimum time of a frame's flight. A longer block counts instead (docs/reference/protocol.md#pacing)."""
 FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 AWAKE_S: Final = 0.6
-"""Maximum time after a report during which the car reads a frame at once. An interval later, it ranges again."""
+"""Maximum time after a report during which the car reads a frame at once. One interval after the report, it ranges."""
 LINK_DELAY_S: Final = 0.3
 """Maximum delay of a report by the link. It shortens the time in which the car is awake."""
 AWAKE_WAIT_S: Final = 1.25
@@ -178,16 +178,16 @@ class Pacing:
                 return self.buffer_until
 
     def act_at(self, frame: Frame, *, alone: bool = False) -> float:
-        """Return the earliest time for the frame of a one-shot. With `alone`, the car must read the frame alone."""
+        """Return the earliest time for the frame of an action on a part. With `alone`, the car must read it alone."""
         if self.profile.kind is Platform.RASPBERRY_PI and not isinstance(frame, General):
-            alone = True  # if it is received with another one, the program dies
+            alone = True  # if the car reads such a frame together with another one, its program dies
         at = max(self.flight_until, self.earliest_named_at(frame))
         return max(at, self.buffer_until) if alone else at
 
     def open_at(self, now: float, *, can_show: bool) -> float:
         """Return when a mode may be opened."""
         # If the car is awake when the mode is opened, the block begins at once, and the car can later show that it left
-        # the mode. So wait for a report, but not for long. Do not wait on a car that cannot show it.
+        # the mode. So wait for a report, but not for long. Do not wait if the car cannot show its stops.
         alone = max(now, self.buffer_until, self.flight_until, self._framed_at + NAMED_GAP_S)
         if alone <= self.awake_until or not can_show:
             return alone

@@ -23,11 +23,12 @@ from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
 _PROBED: Final = (Finding.REPORT, Finding.BLOCK_GAP, Finding.CONTROL)
-"""After one of these findings, the gateway sends a probe or a control, if the car may still show the stop."""
+"""After one of these findings, the gateway sends a probe or a control, if the car may still show the stop. They are the
+test frames of `sequences`."""
 
 
 class StopExecutor:
-    """The stop in progress, if any, and the renewals after it."""
+    """The stop in progress, if any, and the renewals after it: repeats of a stop that the car has not shown."""
 
     def __init__(self, model: CarModel, log: CommandLog) -> None:
         self.model = model
@@ -173,7 +174,10 @@ class StopExecutor:
     # ------------------------------------------------------------------ tries
 
     def settle(self, running: StopInProgress, now: float) -> None:
-        """End the stop as shown, if no reading has followed its last block gap too early."""
+        """End the stop as shown, if no reading has followed its last block gap too early.
+
+        A block gap is an interval between two reports that is longer by just the block of `MODE00`.
+        """
         if self.model.evidence.settle(now):
             self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
 
@@ -360,7 +364,7 @@ class StopExecutor:
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once, because the reports have continued without a block gap.
 
-        The case decides whether to do so, because the reports of a Raspberry Pi always continue.
+        The case of the stop decides whether to do so, because the reports of a Raspberry Pi always continue.
         """
         running.probes += 1
         if (
@@ -423,7 +427,7 @@ class StopExecutor:
         return times
 
     def worst_s(self, now: float) -> float:
-        """Return the longest time until the motors are off if a stop is requested now and its frames arrive."""
+        """Return the longest time until the motors are off, s, if a stop is requested now and its frames arrive."""
         sequence, running = self.full(now), self.running
         if running is not None and running.sequence.rank >= sequence.rank:
             return running.worst_s(now)

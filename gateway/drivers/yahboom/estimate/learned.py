@@ -31,7 +31,7 @@ from schemas.words import Blocking, Mode, Shows
 KEPT_INTERVALS: Final = 9
 """Maximum number of intervals of a rhythm. The newest count."""
 SAME_S: Final = 0.18
-"""Maximum difference of intervals that belong to one rhythm. Those of one car differ by up to 0.08 s each way."""
+"""Maximum difference of intervals that belong to one rhythm. Intervals of one car are up to 0.08 s from their mean."""
 FIRM_INTERVALS: Final = 4
 """Minimum number of intervals to know their spread."""
 FIRST_TOLERANCE_S: Final = 0.12

@@ -24,14 +24,15 @@ RUNNING_SILENCE_S: Final = 1.0
 """Minimum silence that contradicts mode 0 (the first), or modes 2, 5 and 6 (the second). The time of known blocks, and
 of a running fan, is not counted."""
 FIRST_SILENCE_S: Final = 5.0
-"""Minimum silence that contradicts mode 0 while the rhythm of the car is not known yet."""
+"""Minimum silence that contradicts mode 0 while the usual interval of the car's reports is not known yet."""
 SILENCE_MARGIN_S: Final = 0.75
 """How much longer than the car's longest normal interval a silence must be to contradict mode 0."""
 CORRUPTED_MATCH_S: Final = 0.5
-"""Period after a reading of another mode in which a single match may be a corrupted frame, so three are required."""
+"""Period after a reading of another mode in which a single reading of the commanded mode may be a corrupted frame, so
+three are required."""
 MAX_FADE_EXCUSE_S: Final = SERVO_S
-"""Maximum time by which blocks of our frames prolong a confirmation: the block of a servo. A stream of actions must not
-keep a claim alive that no reading supports any more."""
+"""Maximum time by which blocks prolong a confirmation: the block of a servo. In a block, the car is busy with a frame
+of ours, and sends nothing. A stream of actions must not keep a claim alive that no reading supports any more."""
 MAX_BLOCKS: Final = 256
 """Maximum number of blocking frames that are remembered to excuse a silence, as during endless whistling."""
 

@@ -22,9 +22,9 @@ EVIDENCE_FRAMES: Final = 3
 """Number of consecutive frames that make or end evidence. A single one may be corrupted, as there is no checksum."""
 
 OTHER_PROGRAM_FRAMES: Final = 12
-"""Number of consecutive frames of another program, or with another head, after which the car counts as one with that
-program or head. The number is high for two reasons. A link that loses or changes bytes makes such a frame now and then.
-And with a wrong head or platform, the car ignores every named frame."""
+"""Number of consecutive frames of another program, or with another head (first word of a frame), after which the car
+counts as one with that program or head. The number is high for two reasons. A link that loses or changes bytes makes
+such a frame now and then. And with a wrong head or platform, the car ignores every frame of ours that has a head."""
 
 _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
 _MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
@@ -36,7 +36,7 @@ TWO_CELLS_V: Final = 9.0
 
 
 class _PlatformEvidence(Struct):
-    """Debounces one observation over several frames."""
+    """Makes one observation true or false only after several frames in a row that show it."""
 
     holds: bool = False
     _contrary: int = 0

@@ -99,7 +99,7 @@ class Decoder:
         return self._last_at + self._silence_s if self._buffer else None
 
     def sent(self, data: bytes, now: float) -> None:
-        """Remember a frame as written, to recognize its echo for 2 s."""
+        """Remember a frame as written, to recognize its echo (the same bytes coming back) for 2 s."""
         self._sent.pop(data, None)
         self._sent[data] = now
         while len(self._sent) > _SENT_MAX or now - next(iter(self._sent.values())) > ECHO_S:

@@ -1,4 +1,4 @@
-"""The frames to the car: one class per frame of the table, and their conversion to bytes and back.
+"""The frames to the car: one class per frame in docs/reference/protocol.md, and their conversion to bytes and back.
 
 `platforms` says which cars understand a frame. `gateway.control` and the driver decide when it is sent.
 """
@@ -25,8 +25,9 @@ class EncodeError(ValueError):
 class Dialect(Struct, frozen=True):
     """The spelling of the frames of one program.
 
-    `head` is the first word of named frames and readings. With `swaps_green_and_blue`, place 7 has 3 for blue and 4 for
-    green (docs/reference/protocol.md#programs-that-people-have).
+    `head` is the first word of readings and of named frames (all but `General` and `Reset`). With
+    `swaps_green_and_blue`, place 7 has 3 for blue and 4 for green
+    (docs/reference/protocol.md#programs-that-people-have).
     """
 
     head: str = STANDARD_HEAD

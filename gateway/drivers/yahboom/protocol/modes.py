@@ -1,4 +1,7 @@
-"""The modes of the car's program, one row each: digit, times, report rate, measurements and filler."""
+"""The modes of the car's program, one row each: digit, times, report rate, measurements and filler.
+
+The filler of a mode is the fixed text in the fields that the car does not measure in this mode.
+"""
 
 import re
 from collections.abc import Mapping
@@ -47,7 +50,7 @@ def _signature(filler: Mapping[str, bytes]) -> re.Pattern[bytes]:
     return re.compile(sensors_pattern(filler) + b"#?")
 
 
-# The spelling of a placeholder tells the modes apart (docs/reference/protocol.md#placeholders).
+# The spelling of the filler tells the modes apart (docs/reference/protocol.md#placeholders).
 _TRACKING: Final = {"range": b"0", "battery": b"8", "grayscale": b"0", "obstacle": b"00", "light": b"00"}
 _SEEKING: Final = {"range": b"120", "battery": b"8.3", "grayscale": b"000", "line": b"0000", "obstacle": b"00"}
 _FOLLOWING: Final = {"range": b"120", "battery": b"8.3", "grayscale": b"000", "line": b"0000", "light": b"00"}

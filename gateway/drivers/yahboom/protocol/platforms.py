@@ -43,7 +43,7 @@ class StopStyle(StrEnum):
     """The stop sequences of a car (docs/reference/protocol.md#stops)."""
 
     MODE_FRAME = "mode_frame"
-    """`MODE00` stops the car in every mode, and its block shows that it arrived."""
+    """`MODE00` stops the car in every mode. It blocks the car, and the late report after that shows that it arrived."""
     TIMER = "timer"
     """`MODE00` ends a mode, general stops stop the car in mode 0, and no reading shows that either arrived."""
     GENERAL = "general"
@@ -160,7 +160,7 @@ class Profile(Struct, frozen=True, dict=True):
 
     @property
     def ptz_direct(self) -> bool:
-        """True if the servo goes to the angle of a PTZ frame. False if it goes to 180 degrees minus it."""
+        """True if the servo goes to the angle of a PTZ frame. False if it goes to 180 degrees minus that angle."""
         return "ptz_direct" in self.options
 
     @cached_property
@@ -195,7 +195,7 @@ class Profile(Struct, frozen=True, dict=True):
 
     @cached_property
     def close_s(self) -> float:
-        """The expected block of `MODE00`, s. It is used until the car's readings show its own."""
+        """The expected block of `MODE00`, s. It is used until the readings show the block of this car."""
         return self.block_s(ModeClose())
 
     @property
@@ -232,9 +232,10 @@ class Profile(Struct, frozen=True, dict=True):
 
     @property
     def fan_silences(self) -> bool:
-        """True if a running fan may make the car silent (hazards: the fan on; a Raspberry Pi is only blocked for 1 s).
+        """True if a running fan may make the car silent (docs/reference/protocol.md#hazards).
 
-        An stm32 car reports by a timer. Its readings while the fan runs were not observed.
+        It only blocks a Raspberry Pi for 1 s. An stm32 car reports by a timer. Its readings while the fan runs were not
+        observed.
         """
         return self.kind in {Platform.ARDUINO, Platform.UNKNOWN}
 
@@ -312,8 +313,8 @@ class Profile(Struct, frozen=True, dict=True):
     def measured(self, event: Sensors, mode: Mode | None = None) -> frozenset[str]:
         """Return the fields of this frame that are measurements in every mode in which it may have been sent.
 
-        `mode` is the confirmed mode, or None (see `modes_of_frame`). A rejected field is no measurement. A range
-        without an echo is one.
+        `mode` is the confirmed mode, or None (see `modes_of_frame`). A rejected field is no measurement. A range of a
+        ranging without an echo is a measurement.
         """
         common = _common_measurements(self.modes_of_frame(event, mode), candidate_modes(event))
         names = {name for name in common if getattr(event, ATTRIBUTES[name]) is not None}

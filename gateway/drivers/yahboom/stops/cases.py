@@ -1,8 +1,8 @@
 """The cases of a stop: what shows it, when it ends without being shown, and what is sent after it. Pure.
 
-Each stop begins with a case. If the car does not show the stop, this case decides whether the stop may end as `sent`,
-and with which case it ends: the same, or another one. The case at the end decides how the stop is repeated. To add a
-case, add a row here.
+Each stop begins with a case. If the car does not show the stop, this case decides whether the stop may end as `sent`
+(its frames were written, and no more is claimed), and with which case it ends: the same, or another one. The case at
+the end decides how the stop is repeated. To add a case, add a row here.
 
 docs/reference/stop-evidence.md has `CASES` as a table.
 """
@@ -16,7 +16,8 @@ from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from schemas.words import Platform
 
 DOUBTED_PROBES: Final = 2
-"""Maximum probes of a car whose readings contradict its platform. It may be a Raspberry Pi, which never reacts."""
+"""Maximum probes (each a lone `MODE00` as a test) of a car whose readings contradict its platform. The car may be a
+Raspberry Pi, which never reacts."""
 
 
 class StopFacts(Struct, frozen=True):
@@ -67,13 +68,13 @@ class StopCase(Struct, frozen=True, eq=False):
     probes: Callable[[StopFacts], bool] = _no
     """Returns True if the car could react to a `MODE00` now, and show it."""
     repeats_lost: bool = True
-    """True if the stop is sent again at once when the reports continue without a block gap."""
+    """True if the stop is sent again at once when no report is late by just the block of `MODE00` (a block gap)."""
     is_sure: bool = True
     """True if the car counts as standing still after a stop that ended this way."""
     renews_whole: bool = False
     """True if the whole stop is repeated, because the car may still be in the mode."""
     clears: bool = False
-    """True if the first renewals are `MODE00`, which clears half a named frame."""
+    """True if the first repeats of the stop are `MODE00`, which clears half a named frame from the car's buffer."""
 
     def ends(self, facts: StopFacts) -> "StopCase | None":
         """Return the case with which the stop ends now, without evidence. None if it does not end yet."""

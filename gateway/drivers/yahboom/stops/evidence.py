@@ -12,34 +12,35 @@ and no evidence would judge it. The frame that is judged must be the last one.
 
 *Why not one number.* How often a car reports, and for how long `MODE00` blocks it, are properties of its program
 (docs/reference/protocol.md#programs-that-people-have). Reports come every 0.7 s from one car and every 2.2 s from
-another. So nothing here compares a car with a constant: `Learned` has the rhythm and the blocks of this car. A *block
-gap* is an interval that is longer than the rhythm by just the block. A car that reports by a timer has no block gaps,
-so its stops are never shown. That has no other disadvantage: they end as `sent`, and the text says why.
+another. So nothing here compares a car with a constant: `Learned` has the rhythm (the usual interval of the reports)
+and the blocks of this car. A *block gap* is an interval that is longer than the rhythm by just the block. A car that
+reports by a timer has no block gaps, so its stops are never shown. That has no other disadvantage: they end as `sent`,
+and the text says why.
 
 *Why not one block gap.* A link that loses both `MODE00` and the report after it doubles the interval. If the interval
-is about as long as the block, that looks like a block gap. On a car that reports every second, half of all outages of
-0.6 s around a stop look like that. So two block gaps are needed, each around its own `MODE00`. Three are needed if one
-of them is in doubt. A block gap is in doubt if it is too long: the link may be slow, or may have held a report. While
-few intervals have been seen, it is also in doubt if it differs from the block by more than those intervals differ from
-each other.
+is about as long as the block, twice the interval looks like a block gap. On a car that reports every second, half of
+all outages of 0.6 s around a stop do so. So two block gaps are needed, each around its own `MODE00`. Three are needed
+if one of them is in doubt. A block gap is in doubt if it is too long: the link may be slow, or may have held a report.
+While few intervals have been seen, it is also in doubt if it differs from the block by more than those intervals differ
+from each other.
 
 *Why a control.* A half-duplex link receives nothing for a moment at each write. If the car does not receive our frames
 either, each `MODE00` seems to make a block gap, for ever. Often the length of the interval shows whether a report was
-lost or the car was blocked. But if the block is about a whole number of intervals, it does not. Then the gateway writes
-a general stop a third of an interval after a report. This frame does not block, so the next report must come on time.
-Suppose that the link made the block gaps: after each write it is mute for so long that it loses the next report. Then
-it is mute for as long after the general stop, and loses the report after that, too, however much the intervals differ.
-So if that report is missing or damaged, the link made the block gaps.
+lost or the car was blocked. But a block of about a whole number of intervals looks like lost reports. In this case the
+gateway writes a *control*: a general stop, a third of an interval after a report. It does not block, so the next report
+must come on time. Suppose that the link made the block gaps: after each write it is mute for so long that it loses the
+next report. Then it is mute for as long after the general stop, and loses the report after that, too, however much the
+intervals differ. So if that report is missing or damaged, the link made the block gaps.
 
 *Why silence must follow.* A link that holds reports makes intervals of any length. But only the held report comes late.
 The next one comes on time, so the interval between the two is too short. Therefore the last block gap counts only after
 the time in which that next report would have come.
 
 *Modes.* If a car reports in a mode, the form of its next report shows that it left the mode. On a car that was seen to
-block, one report is enough, if it comes at the right time. It must not come too early: the car must have begun it after
-it obeyed `MODE00`. And it must not come too late: if `MODE00` lost its digits on the way, the car opens mode 0 with the
-motors on, and that blocks it for longer. The silence of a silent mode shows nothing. But if the car was shown to stand
-before the mode was opened, the end of the silence shows that it left the mode.
+block, one report is enough, if it comes at the right time. It must not come too early: the car must have begun this
+report after it obeyed `MODE00`. And it must not come too late: if `MODE00` lost its digits on the way, the car opens
+mode 0 with the motors on, and that blocks it for longer. The silence of a silent mode shows nothing. But if the car was
+shown to stand before the mode was opened, the end of the silence shows that it left the mode.
 
 *Damaged reports.* Reports have no checksum. A damaged frame of another mode can look like one of mode 0, so a report
 counts only after a silence that no other mode has. The start of one frame and the end of another can be joined. So the
@@ -232,7 +233,7 @@ class StopEvidence(Struct):
 
     @property
     def settling_s(self) -> float:
-        """Return the wait after the last block gap, s. If the link held a report, the next one comes within it."""
+        """Return the wait after the last block gap, s. If the link held a report, the next one comes in this time."""
         return max(0.0, self.interval_s - self.close_s) + SETTLING_S
 
     # ------------------------------------------------------------------ frames
@@ -284,7 +285,7 @@ class StopEvidence(Struct):
         """Record a `MODE00`. With `awake`, no other frame of ours blocks the car: its block gap will be exact."""
         self._mode_00_at = now if awake else None
         if not awake:
-            self._blocks.append(_Block(None, self.close_s, now))  # so that the habits do not learn this interval
+            self._blocks.append(_Block(None, self.close_s, now))  # so that nothing is learned from this interval
         self._first_delay_s = None
         self._unjudged = False
         self.settles_at = None

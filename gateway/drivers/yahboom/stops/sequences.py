@@ -11,8 +11,9 @@ from schemas.words import Motion
 
 STOP_REPORT_TIMEOUT_S: Final = 4.5
 """Timeout for a report of mode 0 after a stop: avoidance blocks for 4.3 s."""
-# Do not send the general stop while the car may still show that it left its mode: it would follow the evidence, and no
-# evidence would judge it. To send it earlier would not help: a `MODE00` that lost its digits blocks for at least 2.0 s.
+# Do not send the general stop while the car may still show that it left its mode: only the last frame can be judged by
+# a reading, and that must be `MODE00`. To send the general stop earlier would not help: a `MODE00` that lost its digits
+# blocks for at least 2.0 s.
 JUDGED_S: Final = 2.3
 """Time from `MODE00` to the general stop if the car was in another mode than 0."""
 
@@ -124,8 +125,9 @@ CONTROL_SHARE: Final = 0.35
 def control(interval_s: float) -> StopSequence:
     """Return the test that shows whether writing makes the link lose a report: a frame that does not block the car.
 
-    It is sent later after a report than the `MODE00` before it. So if writing `MODE00` made the link mute for long
-    enough to hide the next report, writing this frame hides the next one too, however much the intervals differ.
+    From the last report to this frame passes more time than passed from a report to the `MODE00` before. So if writing
+    `MODE00` made the link mute for long enough to hide the next report, writing this frame hides the next one too,
+    however much the intervals differ.
     """
     return StopSequence("control", 3, (Step(STOP_FRAME, Gate.FLIGHT, after_s=CONTROL_SHARE * interval_s),))
 

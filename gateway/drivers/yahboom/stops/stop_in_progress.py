@@ -27,9 +27,9 @@ _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After that the command fails."""
 EVIDENCE_INTERVALS: Final = 5
-"""Minimum of the timeout for the evidence, as a number of block gaps: three that may be needed (because one may be in
-doubt), one for the report before them, and one for the silence after them. The maximum of the timeout is
-`MAX_EVIDENCE_TIMEOUT_S`."""
+"""Minimum of the timeout for the evidence, as a number of block gaps (intervals that the block of `MODE00` has made
+longer): three that may be needed (because one may be in doubt), one for the report before them, and one for the silence
+after them. The maximum of the timeout is `MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case that is added to the timeout for the evidence, so that nobody waits longer than 17 s for an
 answer, or 23 s with the slowest car."""
@@ -237,7 +237,7 @@ class StopInProgress(Struct):
         return self.report_at if self.report_at > float("-inf") else self.obeys_by
 
     def worst_s(self, now: float) -> float:
-        """Return the longest time until the motors are off, if the frames arrive."""
+        """Return the longest time until the motors are off, s, if the frames arrive."""
         worst_at = self.worst_at + (0.0 if self.frames_sent else max(0.0, now - self.due))
         if self.sequence.is_recovery and self.frames_sent:
             # The car may have read all frames as one string, and so misread them. Then only the next try stops it.
@@ -310,7 +310,7 @@ def soft(context: StopContext) -> StopSequence:
 
 
 def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: float) -> float:
-    """Return the longest time until the motors are off for good, for a sequence that begins now."""
+    """Return the longest time until the motors are off for good, s, for a sequence that begins now."""
     # Add the waits before a frame, the rest of the running block, and the time on the wire
     # (docs/reference/protocol.md#stops). If an unread frame of ours may spoil the first frames, also add the wait until
     # a frame is alone in the buffer.
@@ -321,7 +321,7 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
     if sequence in (sequences.FULL, sequences.FULL_MODE):
         alone_s = max(pacing.buffer_until - now, 0.0)
         if not context.manual and now + alone_s + IN_TIME_S < pacing.earliest_block_end:
-            return block_s + WIRE_S  # the car reads it as the opening ends, before the first turn of the mode
+            return block_s + WIRE_S  # the car reads `MODE00` when the mode has opened, before the mode's first turn
         if not context.manual:
             return max(alone_s, block_s) + context.turn_s + WIRE_S
         return max(alone_s + ranging_s, block_s + FRAME_S) + WIRE_S
