@@ -1,7 +1,7 @@
-"""The voltages at which the battery of a car is full, low, critical and empty: two Li-ion cells at rest. Pure.
+"""The voltages at which a battery of two Li-ion cells without a load is full, low, critical and empty. Pure.
 
-`gateway.control.battery` decides the level by them. A fleet file may set others for a car. They are scaled in
-proportion for a car with another number of cells.
+`gateway.control.battery` decides the level by these voltages. A fleet file may set others for a car. For a car with
+another number of cells, the voltages are scaled in proportion.
 """
 
 from typing import Final
@@ -11,4 +11,4 @@ EMPTY_V: Final = 6.4
 """Both from docs/reference/protocol.md#readings."""
 LOW_V: Final = 7.0
 CRITICAL_V: Final = 6.6
-"""Thresholds of the battery's levels, V at rest."""
+"""Thresholds of the battery's levels, V without a load."""

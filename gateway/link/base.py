@@ -40,7 +40,7 @@ class Link(ABC):
 
     @abstractmethod
     async def close(self) -> None:
-        """Release the port within CLOSE_S. Pending reads and writes raise LinkLost. Raise nothing; be idempotent."""
+        """Release the port within CLOSE_S. Pending reads and writes raise LinkLost. It may be called again."""
 
 
 class Device(ABC):

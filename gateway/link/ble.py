@@ -47,7 +47,8 @@ OTHER_ADAPTERS_S: Final = 1.0
 # Connecting takes 1.1 s, for the fourth car 4 s. Other gateways wait meanwhile, also for a module that does not answer.
 CONNECT_TIMEOUT_S: Final = 10.0
 TURN_TIMEOUT_S: Final = 60.0
-"""Timeout for waiting for the turn and connecting. It is long enough if eight cars are before this one."""
+"""Timeout for connecting, and for the wait before it: only one gateway connects at a time (`ble_adapters.Turn`). It is
+long enough if eight cars are before this one."""
 _CANCEL_RETRY_S: Final = 0.5
 _MIN_PIECE: Final = 20  # at the minimum MTU of 23
 _MAX_LISTED: Final = 5
@@ -223,8 +224,8 @@ class BleLink(BufferedLink):
             for adapter in sorted(turns, key=lambda each: connections.get(each or "", 0)):
                 if not turns[adapter].try_take():
                     continue
-                # Nobody else connects now, so the number does not grow. The last adapter is tried even if it has
-                # ADAPTER_CONNECTIONS, because some can hold more.
+                # Nobody else connects now, so the number of connections does not grow. The last adapter is tried even
+                # if it has ADAPTER_CONNECTIONS, because some can hold more.
                 connections = await ble_adapters.list_connections()
                 if connections.get(adapter or "", 0) >= ADAPTER_CONNECTIONS and await self._free(adapter):
                     connections = await ble_adapters.list_connections()

@@ -16,7 +16,7 @@ from typing import Any, Final
 from schemas.process.file_lock import FileLock
 from schemas.state_dir import default_directory
 
-if sys.platform == "linux":  # bleak brings it there
+if sys.platform == "linux":  # there, bleak installs dbus_fast
     from dbus_fast import BusType, Message
     from dbus_fast.aio import MessageBus
 

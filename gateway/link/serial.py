@@ -61,7 +61,7 @@ _EMPTY_READS_S: Final = 0.5
 
 _opening: Final[set[str]] = set()
 """URLs whose port a thread is opening now."""
-# After a replug, the same path may lead to another car. It must not get this car's commands.
+# After a replug, the same path may lead to another car. That car must not get this car's commands.
 _first_device: Final[dict[str, ListedPort]] = {}
 """The device that was opened first for each URL."""
 # The system does not list pseudo terminals, and `gateway run` starts faster if it does not list the ports.

@@ -1,4 +1,7 @@
-"""Parses the options of a simulated car, such as `+3s` or `+interval=0.7`, into its traits. Pure."""
+"""Parses the options of a simulated car, such as `+3s` or `+interval=0.7`, into its traits. Pure.
+
+Traits are the ways in which the program of one car differs from others of its platform.
+"""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -42,7 +45,7 @@ SIMULATED: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """For each platform the options that exist only in the simulator."""
 UGV_OPTIONS: Final = ("mission", "no_encoder", "quiet", "arm", "gimbal")
-"""The options of the second family's cars: see `UgvCar`."""
+"""The options of the cars of Waveshare's UGV family: see `UgvCar`."""
 _PLACEHOLDERS: Final = {"interval": "S", "spread": "S", "close": "S", "gray": "MAX", SILENT: "MODE"}
 
 

@@ -160,7 +160,7 @@ class PtyEndpoint(SimEndpoint):
             opened_s = path.stat().st_ctime
         except OSError:
             return True
-        # macOS never removes the nodes of its terminals.
+        # Only on Linux, because macOS never removes the nodes of its terminals.
         newer = sys.platform == "linux" and opened_s > path.lstat().st_mtime + _FILE_TIME_MARGIN_S
         return target == self._name or newer
 
@@ -338,7 +338,7 @@ class TcpEndpoint(SimEndpoint):
 
 
 class _Client(asyncio.BufferedProtocol):
-    """One TCP connection, read in small pieces so that a firehose can be paused early."""
+    """One TCP connection, read in small pieces so that a flood of bytes can be paused early."""
 
     def __init__(self, link: TcpEndpoint) -> None:
         self._link = link

@@ -1,6 +1,6 @@
 """Runs the cars of the model in real time, each behind its link, all in one asyncio loop.
 
-The loop's clock is the only clock of the simulator. This also carries out the faults that `faults` parses.
+The loop's clock is the only clock of the simulator. This module also carries out the faults that `faults` parses.
 """
 
 import asyncio

@@ -60,7 +60,7 @@ class TruthPublisher:
                 for car in cars.values():
                     self._put(car)
                 publish_world(loop.time())
-                # Due times count from one origin, so that the rate does not drift. A stalled loop does not catch up.
+                # Due times count from one origin, so that the rate does not drift. Times during a stall are left out.
                 due = max(due + TRUTH_INTERVAL_S, loop.time())
                 await asyncio.sleep(due - loop.time())
         finally:

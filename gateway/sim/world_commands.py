@@ -72,7 +72,7 @@ def _numbers(
 
 
 def as_it_is(world: World, now: float) -> WorldState:
-    """Return the state of lamps and things for the control channel, without those whose carrier is missing."""
+    """Return the state of lamps and things for the control channel, without those on a car that is not there."""
     lamps: dict[str, dict[str, Any]] = {}
     things: dict[str, dict[str, Any]] = {}
     for lamp in world.lamps:

@@ -1,1 +1,1 @@
-"""Bench commands for one link: `gateway scan`, `monitor` and `send`, and what they share."""
+"""Commands for tests of one link at the desk: `gateway scan`, `monitor` and `send`, and what they share."""

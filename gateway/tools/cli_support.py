@@ -1,4 +1,4 @@
-"""Shared parts of the bench commands `scan`, `monitor` and `send`: help, color, exit codes."""
+"""Shared parts of the commands `scan`, `monitor` and `send`: help, color, exit codes."""
 
 import argparse
 import re

@@ -1,4 +1,4 @@
-"""`gateway send`: checks one frame against the table, sends it, and prints what the car may do after it.
+"""`gateway send`: checks one frame against docs/reference/protocol.md, sends it, and prints what the car may do then.
 
 It is for experiments with a car on the desk. It does not pace or repeat frames, and does not stop the car.
 `gateway run` drives a car safely.

@@ -1,4 +1,6 @@
-"""The program of the Arduino car: one loop, one string, modes. Other traits turn it into another car of the family.
+"""The program of the Arduino car: one loop, one string for all received bytes, and modes.
+
+Other traits turn it into another car of the family.
 
 It reads its string by position, as the real program does, and does not use our codec. "Row" in a comment means the row
 of that name in docs/reference/protocol.md.
@@ -13,7 +15,8 @@ from gateway.sim.model.mode_car import ARDUINO_LIGHTS, MODE_OF_DIGIT, ModeCar, t
 from schemas.words import Mode
 
 TX_BUFFER: Final = 64
-# A wedged car never clears its string, so in the real program the string grows until the RAM is full.
+# A car that got a named frame it does not know never clears its string. In the real program, the string grows until the
+# RAM is full.
 STRING_LIMIT: Final = 512
 """Maximum length of the string. Further bytes are dropped."""
 START_SPEED: Final = 150
@@ -162,7 +165,7 @@ class ArduinoCar(ModeCar):
     # Mode 0.
 
     def _manual(self) -> Program:
-        """Wait for a byte or the next frame to send. While the fan runs, loop turns do not count."""
+        """Wait for a byte, or send the next frame. While the fan runs, loop turns do not count, so nothing is sent."""
         since = self._now
         due = inf if self._fan else since + min(self._due.values(), default=inf)
         yield Wait(due, wakes=True)

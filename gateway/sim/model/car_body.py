@@ -78,7 +78,7 @@ class CarBody:
         return TOP_SPEED_M_S * self._left / 255, TOP_SPEED_M_S * self._right / 255
 
     def glide(self, now: float) -> None:
-        """Move on to `now`, at most one tick, as far as there is room. This is for a lively world only."""
+        """Move on to `now`, at most one tick, as far as there is room. For a lively world only (see `World.lively`)."""
         span = now - self._now
         if span <= 0:
             return

@@ -59,7 +59,7 @@ def build_ugv(
     now: float = 0.0,
     name: str = "",
 ) -> UgvCar:
-    """Return a car of the second family, whose program has already run for a while without a gateway."""
+    """Return a car of Waveshare's UGV family, whose program has already run for a while without a gateway."""
     body = CarBody(world, world.start_pose(index, name), rng, now, name)
     car = UgvCar(UGV_BUILDS[platform], body, rng, options=options, now=now)
     if world.lively:

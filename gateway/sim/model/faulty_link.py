@@ -25,7 +25,7 @@ class Direction(StrEnum):
 
 
 class Flood(StrEnum):
-    """The bytes of a firehose."""
+    """The kind of bytes that the fault `firehose` sends."""
 
     NOISE = "noise"
     FRAME = "frame"

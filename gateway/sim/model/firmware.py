@@ -28,7 +28,7 @@ CHUNK: Final = 20
 WHISTLE_S: Final = 0.30
 SERVO_S: Final = 0.65
 COLOR_S: Final = 0.10
-# The vendor's Arduino program was measured at about 0.68 s. The table's 1.0 s, used here, is the worst case.
+# The vendor's Arduino program was measured at about 0.68 s. The 1.0 s of docs/reference/protocol.md is the worst case.
 NO_ECHO_S: Final = 1.0
 ECHO_S_PER_CM: Final = 58e-6
 """Time of the sound for 1 cm of distance, there and back."""

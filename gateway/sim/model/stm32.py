@@ -98,7 +98,7 @@ class Stm32Car(ModeCar):
         self._buffer.clear()
 
     def _obey_buffer(self) -> None:
-        """Obey the buffer if a frame was complete since the last look, whatever is in it now.
+        """Obey the buffer if a frame has become complete since the last call, whatever is in the buffer now.
 
         If another frame has begun since then, its beginning has overwritten that of the complete frame. This call
         clears the buffer with that beginning. The rest of the new frame arrives later and is put behind the cleared

@@ -1,7 +1,7 @@
 """The traits in which cars with one program differ. Pure.
 
-Public programs of one family differ in the rhythm of their reports, in what blocks them and in what they print. A trait
-is a parameter of a simulated car, so that each of these cars can be tried.
+Public programs of one family differ in how often they report, in what blocks them and in what they print. A trait is a
+parameter of a simulated car, so that each of these cars can be tried.
 """
 
 from typing import Final
@@ -41,7 +41,7 @@ class CarTraits(Struct, frozen=True):
     fan_level: bool = False
     """True if place 8 is a level: 1 turns the fan on, 0 turns it off in every general frame."""
     ptz_direct: bool = False
-    """True if the servo goes to the angle of a PTZ frame, and not to 180 degrees minus it."""
+    """True if the servo goes to the angle of a PTZ frame, and not to 180 degrees minus that angle."""
     gray_max: int = 1023
     """Maximum of the grayscale reading."""
     more: str = ""

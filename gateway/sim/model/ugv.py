@@ -42,7 +42,7 @@ PAGE_S: Final = 1.5
 PAGE_ASKS_S: Final = ((1.0, 130), (2.5, 405))
 """Intervals of the page's queries (number `T`) while it is open. The answers are sent to the UART, too."""
 WIFI_S: Final = 15.0
-"""Time for which `T:403`, `T:404` and `T:407` look for a network. Meanwhile nothing runs, not even the dead-man."""
+"""Time for which `T:403`, `T:404` and `T:407` look for a network. Nothing else runs, not even the dead-man timer."""
 SERVO_SEARCH_S: Final = 0.1
 """Time for which the car waits for a servo that does not answer."""
 PAGE_OPEN_S: Final = 10.0
@@ -93,7 +93,7 @@ class UgvCar:
 
     - `mission`: the boot mission drives for 2 s.
     - `no_encoder`: the left encoder counts nothing, as with a loose wire.
-    - `quiet`: `T:605` is 0, so there is no echo.
+    - `quiet`: `T:605` is 0, so the car does not repeat the lines that it gets.
     - `arm`: the boot mission says that there is an arm. Its position then overwrites fields of the same name in the
       feedback: the yaw `y`, or with ROS the accelerations `ax`, `ay`, `az`.
     - `gimbal`: the boot mission says that there is a gimbal, but there is none. So each turn of the loop waits for two
@@ -360,7 +360,7 @@ class UgvCar:
             self._duty[side] = duty if abs(duty) >= DEAD_DUTY else 0.0
 
     def _measured(self, side: int) -> float:
-        """Return the speed that the encoder of a side measures. Without one, it is 0, and a closed loop winds up."""
+        """Return the speed that an encoder measures. Without it, the speed is 0, and a closed loop raises the duty."""
         if not self._build.has_encoders or ("no_encoder" in self._options and side == 0):
             return 0.0
         return self._sign * round(self._wheels[side], 3)
@@ -372,9 +372,9 @@ class UgvCar:
         return 1 if (self._main in inverted) is (self._build.main in inverted) else -1
 
     def _check_dead_man(self, now: float) -> None:
-        """Stop once if nothing has restarted the dead-man timer in time. There is no message, and no latch.
+        """Stop once if nothing has restarted the dead-man timer in time. The car sends no message.
 
-        So the next command drives the car again.
+        The stop does not last: the next command drives the car again.
         """
         if not self._timed_out and 0.0 <= self._dead_man_s < now - self._fed_at:
             self._timed_out, self._unguarded, self._raw = True, False, False
