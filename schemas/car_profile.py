@@ -1,4 +1,4 @@
-"""What cars of one platform can do, as their driver describes it. Pure; `gateway.drivers` has the profiles."""
+"""The profile of a platform: its driver says in it what such cars can do. Pure; `gateway.drivers` has the profiles."""
 
 from typing import Protocol
 
@@ -6,7 +6,7 @@ from schemas.words import Light, Mode, ServoAction
 
 
 class CarProfile(Protocol):
-    """What cars of one kind can do. One object for each name of a platform."""
+    """Says what cars of one kind can do. There is one object for each name of a platform, with its options."""
 
     def __hash__(self) -> int:
         """Return a hash. Profiles are values: two profiles of the same name are equal."""

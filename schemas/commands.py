@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 
 class Verb(StrEnum):
-    """What a command does. `COMMANDS` has a row for each."""
+    """The kind of a command. `COMMANDS` has a row for each."""
 
     DRIVE = "drive"
     MODE = "mode"
@@ -34,7 +34,7 @@ class CommandType(NamedTuple):
     verb: Verb
     about: str
     effect: str = ""
-    """Text of the outcome when its frames were sent. Empty if `fleet.client.effects` has its texts."""
+    """Text of the outcome when the frames of the command were sent. Empty if `fleet.client.effects` has its texts."""
     ttl_s: float = 2.0
     """Default of the maximum age at arrival (docs/reference/commands.md#payload)."""
     wildcard: bool = False

@@ -115,7 +115,7 @@ def speaks_for(identity: str, sender: str, kind: str, verb: str) -> bool:
                 return verb in STOPS or verb not in COMMANDS  # the others are verbs of services, such as a new plan
             return name == Service.CONSOLE and not is_coordinator
         case IdentityRole.SITE:
-            return False  # it passes on what others send under their own identities
+            return False  # the hub of a site passes on what others send under their own identities
 
 
 def may_locate(identity: str, of: str) -> bool:

@@ -19,7 +19,8 @@ which reports every 3 s, with the longest `MODE00` (`stop_in_progress.SLOWEST_S`
 less has time for five reports."""
 # Without this silence, the next sample of a held joystick would restart the car 50 ms after another person's stop.
 STREAM_SILENCE_S: Final = 0.5
-"""Minimum silence of a drive stream after a stop. A release counts as such a silence at once."""
+"""Minimum silence of a drive stream after a stop. A release (a drive with motion stop) counts as such a silence at
+once."""
 SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""
 MAX_REASON_LENGTH: Final = 200

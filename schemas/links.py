@@ -66,13 +66,13 @@ class LinkUrl(ABC):
     options: ClassVar[str] = ""
     """The options that may follow such a URL, for the help."""
     module: ClassVar[str] = ""
-    """The Python module that this kind of link needs and the basic installation lacks. Empty if none."""
+    """The Python module that this kind of link needs, but the basic installation lacks. Empty if there is none."""
     extra: ClassVar[str] = ""
     """The extra of our package that installs this module."""
     needs: ClassVar[str] = ""
     """The name of what the module brings, for people."""
     harm: ClassVar[str] = ""
-    """The harm that opening and closing it may do to a car, in words. Empty if none."""
+    """The harm that opening and closing the link may do to a car, in words. Empty if none."""
 
     @classmethod
     @abstractmethod
@@ -94,7 +94,7 @@ class LinkUrl(ABC):
     @property
     @abstractmethod
     def port_key(self) -> PortKey:
-        """The port that it names. Symlinks are followed."""
+        """The port that the link names. Symlinks are followed."""
 
     def possible_ports(self) -> Iterator[PortKey]:
         """Yield the keys of all links that may name the port of this one."""
@@ -174,7 +174,7 @@ class SerialUrl(_SerialLine):
 
     @property
     def port_key(self) -> PortKey:
-        """The port that it names."""
+        """The port that the link names."""
         # Resolve symlinks such as those in /dev/serial/by-id. On Windows, COM3 and com3 are one port.
         device = self.path.upper() if _WINDOWS_PORT.fullmatch(self.path) else os.path.realpath(self.path)
         return ("device", device, frozenset())
@@ -214,7 +214,7 @@ class UsbUrl(_SerialLine):
 
     @property
     def port_key(self) -> PortKey:
-        """The port that it names."""
+        """The port that the link names."""
         ids = (("vid", self.vid), ("pid", self.pid), ("serial", self.serial))
         return ("usb", "", frozenset((name, str(value)) for name, value in ids if value is not None))
 
@@ -275,7 +275,7 @@ class TcpUrl(LinkUrl):
 
     @property
     def port_key(self) -> PortKey:
-        """The port that it names."""
+        """The port that the link names."""
         return ("tcp", _host(self.host), frozenset({("port", str(self.port))}))
 
     def check(self, look: Look) -> tuple[bool, str]:
@@ -321,7 +321,7 @@ class BleUrl(LinkUrl):
 
     @property
     def port_key(self) -> PortKey:
-        """The port that it names."""
+        """The port that the link names."""
         return ("ble", self.address or "", frozenset() if self.name is None else frozenset({("name", self.name)}))
 
     def without_options(self) -> "BleUrl":

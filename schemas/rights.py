@@ -1,10 +1,11 @@
 """Decides who may do what with a car: people and ranks, e-stops, pauses, holds, loans and leases. Pure.
 
 Gateway, console and coordinator use the same rules. A gateway makes its `Authority` from its own state, the others from
-the `state/safety` that it publishes. Only the gateway decides; the others show in advance what it would answer.
+the `state/safety` that the gateway publishes. Only the gateway decides; the others show in advance what it would
+answer.
 
-Without people every person may drive every car, and nobody is a lead. A name on the bus is a convention: the gateway
-checks nobody's identity. A stop or an e-stop needs no right.
+Without people in the fleet file, every person may drive every car, and nobody is a lead. These rules take the name of
+a sender as true (`identity` checks it on a hub with certificates). A stop or an e-stop needs no right.
 """
 
 from collections.abc import Iterable, Mapping
@@ -178,7 +179,7 @@ class Hold(Struct, frozen=True):
 
 
 class Estop(Struct, frozen=True):
-    """One latched emergency stop. `at_ns` is the wall clock since the epoch. If `fleet_wide`, all gateways latch it."""
+    """One emergency stop in force; if `fleet_wide`, for all cars. `at_ns` is the wall clock, ns since the epoch."""
 
     id: str
     by: str
@@ -303,7 +304,7 @@ _REASONS: Final = {
 
 
 class Denial(Struct, frozen=True):
-    """Why a right is denied. `mark` is the e-stop, pause, hold, loan or lease that it rests on."""
+    """Why a right is denied. `mark` is the e-stop, pause, hold, loan or lease that denies it."""
 
     bar: Bar
     mark: Mark | None = None
@@ -338,7 +339,7 @@ class Authority(Struct, frozen=True):
         )
 
     def may(self, sender: Sender, right: Right) -> Denial | None:
-        """Return why this sender may not do it, or None if it may. `People.ranked` must have set the sender's rank."""
+        """Return why this sender lacks the right, or None if not. `People.ranked` must have set the sender's rank."""
         people = self.people
         match right:
             case Right.MOVE | Right.TAKE:
@@ -392,8 +393,8 @@ class Authority(Struct, frozen=True):
     def may_end_estop(self, estop: Estop, sender: Sender) -> bool:
         """Return True if the sender may end this e-stop. The coordinator ends none.
 
-        Only a lead may end a lead's e-stop. Another e-stop may be ended by the person who latched it and by all who may
-        drive this car. A fleet-wide one may be ended by every person of the fleet, so that all gateways decide alike.
+        Only a lead may end a lead's e-stop. Another e-stop may be ended by the person who began it and by all who may
+        drive this car. If it is fleet-wide, every person of the fleet may end it, so that all gateways decide alike.
         """
         people, person = self.people, sender.person
         if sender.kind is Rank.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):

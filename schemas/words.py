@@ -133,14 +133,14 @@ CAPABILITIES: Final = (
     *("mode", "led", "servo_deg", "arm", "servo_vertical", "servo_horizontal"),
     *("drive", "whistle", "speed", "servo", "fan", "light"),
 )
-"""What cars may be able to do, as `state/health` lists it. Capabilities that some cars lack come first."""
+"""The capabilities of cars, as `state/health` lists them. Those that some cars lack come first."""
 
 
 class Rank(StrEnum):
     """The kind of a sender, which is its rank. Each outranks those below it."""
 
     LEAD = "lead"
-    """A person whom the people table of the gateway names as a lead. No command may claim it."""
+    """A person whom the people table of the gateway names as a lead. No command may claim this rank."""
     PERSON = "person"
     SCRIPT = "script"
     COORDINATOR = "coordinator"
@@ -284,7 +284,7 @@ class BatteryAction(StrEnum):
 
 
 class Shows(StrEnum):
-    """Whether the car's reports show that a stop arrived."""
+    """The finding whether the car's reports show that a stop arrived."""
 
     UNKNOWN = "not_known_yet"
     YES = "yes"
@@ -394,7 +394,7 @@ class ProcessKind(StrEnum):
 
 
 class RunState(StrEnum):
-    """The state of one process. ELSEWHERE: another program does its work."""
+    """The state of one process. ELSEWHERE: another program does the work of this process."""
 
     WAITING = "waiting"
     STARTING = "starting"

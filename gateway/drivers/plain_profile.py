@@ -6,7 +6,7 @@ from schemas.words import CAPABILITIES, Light, Mode, ServoAction
 
 
 class PlainProfile(Struct, frozen=True):
-    """What cars of one platform can do: a `CarProfile` without modes."""
+    """Says what cars of one platform can do: a `CarProfile` without modes."""
 
     name: str
     capabilities: frozenset[str]

@@ -10,7 +10,7 @@ import zenoh
 from schemas.bus.overlap import Overlap, mark_of_sample
 
 Declare = Callable[[zenoh.Session, int], Any]
-"""Declares something in a session. The number is the session's: a callback must know over which one it is called."""
+"""Declares something in a session. The number is that of the session: a callback must know which session calls it."""
 
 
 class Declared:
@@ -82,7 +82,7 @@ class SampleChannel(Declared):
 
         def receive() -> zenoh.Sample | None:
             is_over = self._older_is_over
-            with suppress(zenoh.ZError):  # it is undeclared, and empty
+            with suppress(zenoh.ZError):  # the older declaration is undeclared, and empty
                 while (sample := older()) is not None:
                     if not overlap.is_twin(mark_of_sample(self._declaration, sample), monotonic(), newer=False):
                         return sample

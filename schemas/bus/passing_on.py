@@ -1,9 +1,9 @@
 """Finds out whether a hub with certificates passes on the messages of a session.
 
-A hub applies its rules without any message. So a program whose certificate was revoked is still linked, but no message
-of it arrives anywhere, and it receives none. This module therefore looks for something that only this session can have
-published: its own token. It asks for the token over a second session. That is not a command, and every identity that a
-rule knows may declare and see tokens.
+A hub applies its rules without telling anybody. So a program whose certificate was revoked is still linked, but no
+message of it arrives anywhere, and it receives none. This module therefore looks for something that only this session
+can have published: its own token. It asks for the token over a second session. Such a question is no command, and every
+identity that a rule knows may declare and see tokens.
 """
 
 import time

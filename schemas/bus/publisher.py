@@ -1,4 +1,4 @@
-"""Publishes one topic of one car, numbered and cached for backfill."""
+"""Publishes one topic of one car, numbered and cached for backfill: for a recorder that has missed messages."""
 
 from typing import Any, Final
 
@@ -50,7 +50,7 @@ class Publisher:
         self._next = self._declared_in(session)
 
     def move(self) -> None:
-        """Publish in that session from now on. Its cache is empty, and Zenoh's numbers restart, but `seq` continues."""
+        """Publish in the prepared session from now on. Zenoh's numbers restart with an empty cache; `seq` continues."""
         self._publisher = self._next
 
     def put(self, message: Any, stamp_ns: int) -> bytes:

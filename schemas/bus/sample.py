@@ -43,8 +43,8 @@ class Sample(NamedTuple):
         name = messages.name_in(self.encoding)
         if name is None:
             raise messages.BadPayload(f"{self.key}: encoding {self.encoding!r} names no message")
-        # Anybody may publish any message under any key, but readers use the fields of the topic's message. So parse it
-        # as that.
+        # Anybody may publish any message under any key, but readers use the fields of the topic's message. So parse the
+        # payload as the topic's message.
         topic = topics.of_key(self.key)
         return messages.parse(name if topic is None else topic.message, self.payload, self.encoding)
 

@@ -40,7 +40,7 @@ LINK_TIMEOUT_S: Final = 2.0
 """Time for which a question for tokens waits for a lost link. After 0.2 to 0.5 s a session has its link again."""
 _LINK_POLL_S: Final = 0.02
 _PROMPT_S: Final = 1.0
-"""Half the lease of a link. If an answer takes longer, the link may have ended before it was whole."""
+"""Half the lease of a link. If an answer takes longer, the link may have ended before the answer was whole."""
 _END_OF_LINK_S: Final = 0.1
 """Time within which a session notices that its link has ended."""
 
@@ -474,8 +474,8 @@ class Bus:
     def recall(self, expression: str, last_s: float, *, timeout_s: float = 5.0) -> Iterator[zenoh.Sample]:
         """Return publications of the last seconds from the caches of running publishers (`Publisher`).
 
-        They have their original time and sequence number. Those of one publisher are in order. Reading blocks until all
-        publishers have answered.
+        These publications have their original time and sequence number. Those of one publisher are in order. Reading
+        blocks until all publishers have answered.
         """
         replies = self._session.get(
             f"{expression}/@adv/pub/**?_time=[now(-{last_s:.3f}s)..]",  # where zenoh.ext's publishers answer

@@ -1,4 +1,4 @@
-"""A lock between the processes of one user: a locked file. The lock ends with its holder, even if that is killed."""
+"""A lock between the processes of one user: a locked file. It ends with its holder, even if the holder is killed."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Log lines as JSON, for every process, if FLEET_LOG is `json`. One id follows a command through all of them.
+"""Log lines as JSON, for every process, if FLEET_LOG is `json`. All lines about one command have the same id.
 
 Without the variable each process logs lines for a person. With it, each log line on stderr is one JSON object with
 `time`, `level`, `process`, `pid` and `message`. A line about a command also has its `command_id`, `verb` and `phase`.
@@ -91,7 +91,7 @@ def begin(process: str) -> bool:
 def message_in(line: str) -> tuple[str, str] | None:
     """Return level and message of a line that a process of ours has logged as JSON. None if it is not one.
 
-    Text that it wrote to stderr for a person counts as an error, because it may say why the process ended.
+    Text that a process wrote to stderr for a person counts as an error, because it may say why the process ended.
     """
     if not line.startswith("{"):
         return None

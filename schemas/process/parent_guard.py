@@ -1,7 +1,7 @@
 """Runs one program and ends it when its own standard input ends: `python -m schemas.process.parent_guard PROGRAM ...`.
 
-Its parent has the other end of stdin. So the program ends with the parent, even if that is killed. The first line on
-stdout is the program's process id.
+The parent of this process has the other end of stdin. So the program ends with the parent, even if the parent is
+killed. The first line on stdout is the program's process id.
 """
 
 import os

@@ -82,7 +82,8 @@ def quote_value(value: object) -> str:
 def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Mapping[str, Any]) -> tuple[str, str]:
     """Return two texts about one of pydantic's errors: what is wrong, and how to mend it. The second may be empty.
 
-    `kind` is pydantic's type of the error, such as `missing`. `where` is the place, and `schema` that of the model.
+    `kind` is pydantic's type of the error, such as `missing`. `where` is the place of the value, and `schema` the JSON
+    schema of the model.
     """
     definitions = schema.get("$defs", {})
     if kind == "extra_forbidden":

@@ -60,7 +60,7 @@ class StopCase(Struct, frozen=True, eq=False):
     shown_by: str
     """The evidence that shows the stop, for the docs. Empty if the car cannot show it."""
     otherwise: str
-    """What happens if the stop is not shown, for the docs."""
+    """The next steps if the stop is not shown, for the docs."""
     words: str = ""
     """Why the stop ends as `sent`, for the record; `{car}` is the car's name."""
     rule: Callable[["StopCase", StopFacts], "StopCase | None"] = _never
