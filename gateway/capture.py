@@ -58,7 +58,7 @@ class CaptureWriter:
 
 
 def read(path: Path) -> Iterator[CapturedBytes]:
-    """Yield the pieces of a capture in order, without a truncated last line. Raises BadCapture for another file."""
+    """Yield the pieces of a capture in order, without a truncated last line. Raises BadCapture for any other file."""
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISFIFO(mode)):
         kind = "directory" if stat.S_ISDIR(mode) else "device"

@@ -85,7 +85,7 @@ class Settings(Struct, frozen=True):
     parent: int | None = None
     """Process id of the parent; the gateway ends with it."""
     holds_of: str = ""
-    """The car that the saved holds and loans belong to. If this is empty, they belong to the car at the link."""
+    """Name under which the holds and loans of the car are saved. Empty: they are saved under the link of the car."""
 
 
 class CarGateway:

@@ -1,4 +1,4 @@
-"""Saves what was learned about one car in a small JSON file: its rhythm, its delays, and whether it can show a stop.
+"""Saves what was learned about one car in a small JSON file: how often and how late it reports, and if it shows stops.
 
 The file is for one platform and one link. If the car now has another platform or link, or if the file is damaged, the
 gateway does not use it and begins as with an unknown car.

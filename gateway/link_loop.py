@@ -187,7 +187,7 @@ class LinkLoop:
         self._wake.set()
 
     def check(self, now: float) -> None:
-        """Log the opening of a link that is now proven, if it is not logged yet.
+        """Log the opening of a link that is now proven, if this opening is not logged yet.
 
         If bytes are damaged or missing, let the link look for the cause. Log each cause once.
         """

@@ -45,7 +45,7 @@ class Writer:
         """Set when the driver has finished after `shut_down`."""
 
     async def run(self, flush: Callable[[], None]) -> None:
-        """Write frames when control needs it. Call `flush` after each turn, to publish records and answer queries."""
+        """Write frames when they are due. Call `flush` after each turn, to publish records and answer queries."""
         while True:
             self._wake.clear()
             await self._write_due()

@@ -8,7 +8,7 @@ from typing import Final
 
 FULL_V: Final = 8.4
 EMPTY_V: Final = 6.4
-"""Both from docs/reference/protocol.md#readings."""
+"""FULL_V and EMPTY_V are the range of the battery, V, from docs/reference/protocol.md#readings."""
 LOW_V: Final = 7.0
 CRITICAL_V: Final = 6.6
-"""Thresholds of the battery's levels, V without a load."""
+"""LOW_V and CRITICAL_V are the voltages at which a battery without a load becomes low and critical, V."""

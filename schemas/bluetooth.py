@@ -3,9 +3,9 @@
 from typing import Final
 
 ADAPTER_CONNECTIONS: Final = 5
-"""Connections that most adapters can hold (home-assistant #84331). An adapter does not report its limit."""
+"""Number of connections that most adapters can hold (issue 84331 of home-assistant). No adapter reports its limit."""
 SMALL_ADAPTER_CONNECTIONS: Final = 3
-"""Connections that the smallest adapters can hold (bleak #1858)."""
+"""Number of connections that the smallest adapters can hold (issue 1858 of bleak)."""
 ADAPTER_NOTIFICATIONS_PER_S: Final = 165
 """Notifications per second that an adapter carries (docs/explanation/measurements.md#bluetooth)."""
 # In tracking, a car sends up to 27 reports a second (docs/reference/protocol.md#rates), each in 3 pieces of 20 bytes.

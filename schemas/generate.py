@@ -23,7 +23,10 @@ def generate(out: Path) -> list[Path]:
 
 
 def main(arguments: list[str]) -> int:
-    """Generate, or with --check compare with what is checked in: 1 and the names of stale files if they differ."""
+    """Generate the files, and return 0. With --check, compare them with those in schemas/gen instead.
+
+    If some differ, print their names and return 1.
+    """
     if arguments != ["--check"]:
         for path in generate(GENERATED):
             sys.stdout.write(f"{path.relative_to(HERE.parent)}\n")

@@ -339,7 +339,10 @@ class Authority(Struct, frozen=True):
         )
 
     def may(self, sender: Sender, right: Right) -> Denial | None:
-        """Return why this sender lacks the right, or None if not. `People.ranked` must have set the sender's rank."""
+        """Return why this sender lacks the right, or None if the sender has it.
+
+        `People.ranked` must have set the sender's rank.
+        """
         people = self.people
         match right:
             case Right.MOVE | Right.TAKE:

@@ -22,7 +22,10 @@ class RunningMark:
         self._lock = FileLock(directory / f"{fleet}.{car}{_SUFFIX}")
 
     def renew(self) -> None:
-        """Set the mark if it is not set. Call this regularly: a program that looks for marks takes each one briefly."""
+        """Set the mark if it is not set.
+
+        Call this regularly, because it may fail: a program that looks for marks takes each lock for a moment.
+        """
         with suppress(OSError):  # a full disk, or a place without locks: the gateway runs all the same
             self._lock.try_take()
 

@@ -1,10 +1,10 @@
 """The bus service of one car: its queryables, its drive subscription, its token, and the check for a second gateway.
 
-The gateway declares the service before it imports the rest of its modules, which takes half of its start. So the car is
-on the bus early, and queries wait for `attach`. Do not import heavy modules here.
+The gateway declares the service before it imports the rest of its modules, because these imports take half of the time
+of its start. So the car is on the bus early, and queries wait for `attach`. Do not import heavy modules here.
 
-Commands go before queries of values: a command waits for one turn of the loop. Queries of the latest values wait in a
-queue, and queries of the history in another one.
+Commands go before queries of values: a command waits only for the next turn of the loop. Queries of the latest values
+wait in a queue, and queries of the history in another one.
 """
 
 import time

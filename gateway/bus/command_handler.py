@@ -138,7 +138,7 @@ class CommandHandler:
 
     def _save(self) -> None:
         """Save a changed safety state."""
-        # Save before answering: a person who reads that the e-stop is latched may switch the computer off.
+        # Save before answering: a person who reads that the e-stop is in force may switch the computer off.
         safety = self._control.safety.persisted
         if safety == self._saved_safety:
             return

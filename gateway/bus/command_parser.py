@@ -53,7 +53,7 @@ ARM_JOINTS: Final = 6
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
 _SAME_QUERY_NS: Final = 2_000_000_000
-"""Maximum time in which one query reaches all gateways."""
+"""Maximum time in which one query reaches all gateways (see `_id`)."""
 _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
 """The kinds of sender that a command may name. Only the fleet file says which person is a lead."""
 # One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
@@ -212,7 +212,7 @@ def _text(field: str, value: str, forbidden: str = "") -> str:
 
 
 def _word(field: str, value: str, allowed: Iterable[W]) -> W:
-    """Return the allowed word that equals this value. Raises ValueError with the likely word, or with all."""
+    """Return the allowed word that equals this value. Raises ValueError with the likely word, or with all words."""
     words = list(allowed)
     if value in words:
         return words[words.index(value)]

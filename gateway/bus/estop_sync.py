@@ -31,8 +31,8 @@ FIRST_RETRY_S: Final = 0.5
 MAX_RETRY_S: Final = 10.0
 """Maximum retry interval. Retries never end, because a starting gateway may know an e-stop that no other one knows."""
 SYNC_QUERY_TIMEOUT_S: Final = 2.5
-"""Time for the answers to one query. When two sites are linked again, they ask each other at once, which fills the
-link. With a timeout of 1 s and 5 % of the packets lost, an e-stop needed 2 to 17 s from one site to the other."""
+"""Time for the answers to one query. When two sites are linked again, all their gateways query each other, which fills
+the link. With a timeout of 1 s and 5 % of the packets lost, an e-stop needed 2 to 17 s from one site to the other."""
 MAX_SINGLE_QUERIES: Final = 8
 """Number of gateways that may always be queried one by one, whatever their share of the fleet is."""
 MAX_SINGLE_SHARE: Final = 0.5
@@ -83,7 +83,7 @@ class EstopSync:
     def forward(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
         """Send a fleet-wide e-stop, a pause, or the end of one to all gateways.
 
-        This is only for a command that came to this car alone.
+        Call it only for a command that came to this car alone, so that the other gateways do not know it.
         """
         fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
         payload: pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand

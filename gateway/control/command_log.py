@@ -55,7 +55,7 @@ class Pending(Struct):
 
 
 class CommandLog:
-    """Records each transition. Of a stream, it records the start, the end, and the first rejection for each reason."""
+    """Records each transition. Of a stream of drives, it records only start, end, and the first rejection by reason."""
 
     def __init__(self) -> None:
         self._records: list[Record] = []

@@ -96,7 +96,7 @@ class Stop(Struct, frozen=True):
 
 
 class EmergencyStop(Struct, frozen=True):
-    """Stop the car, and refuse commands until a resume with this id. If `fleet_wide`, all gateways latch it."""
+    """Stop the car, and refuse commands until a resume with this id. If `fleet_wide`, all gateways do so."""
 
     why: str = ""
     fleet_wide: bool = False

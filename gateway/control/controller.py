@@ -162,7 +162,7 @@ class Controller(Generic[D_co]):
         pending, what = Pending(command, now), command.what
         if self._log.has_accepted(command) and not isinstance(what, Stop | EmergencyStop):
             words = f"a command with id {command.id} was accepted before. Use a new id."
-            if not command.streamed:  # the records with this id belong to the first command, so only log this one
+            if not command.streamed:  # the records with this id are of the first command, so only log the second
                 self._log.log(Level.WARNING, "duplicate", f"{command.verb} by {command.sender.name}: {words}", now)
                 return Answer(Phase.REJECTED, Reason.DUPLICATE, words)
             return self._reject(pending, Reason.DUPLICATE, words, now)

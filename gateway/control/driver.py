@@ -44,8 +44,8 @@ from schemas.words import (
 TICK_S: Final = 0.2
 """Interval at which a gateway calls `Driver.tick`."""
 STALL_S: Final = 0.5
-"""Maximum gap of the loop during a held motion. After a longer one the gateway stops the car
-(docs/explanation/how-it-works.md#processes-and-threads)."""
+"""Maximum gap of the loop (a time in which it does not run) during a held motion. After a longer one the gateway stops
+the car (docs/explanation/how-it-works.md#processes-and-threads)."""
 LATE_DRIVE_S: Final = 0.1
 """A drive may begin this long after its request. If it begins later, its sender is told how long it waited."""
 MOVED_CM: Final = 5.0

@@ -1,4 +1,4 @@
-"""Tracks senders: lost liveliness tokens, and senders of drives that must be silent after a stop."""
+"""Tracks senders: whose liveliness token is lost, and who must send no drive for a while after a stop."""
 
 from typing import Final
 

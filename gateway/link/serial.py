@@ -52,8 +52,8 @@ _RFCOMM_FAR: Final = frozenset(
     {errno.ECONNREFUSED, errno.EHOSTUNREACH, errno.ETIMEDOUT, errno.EIO, getattr(errno, "EHOSTDOWN", errno.EIO)}
 )
 """Errors when opening the port of a Bluetooth Classic module that is off, out of range or not paired."""
-# A second reader causes at most one empty read for each byte, so at most 500 within `_EMPTY_READS_S`. A broken port
-# returns empty reads without end.
+# If another program reads the same port, each byte causes at most one empty read, so there are at most 500 within
+# `_EMPTY_READS_S`. A broken port returns empty reads without end.
 _MAX_EMPTY_READS: Final = 2000
 """Number of empty reads within _EMPTY_READS_S after which the port counts as gone."""
 _EMPTY_READS_S: Final = 0.5

@@ -174,7 +174,7 @@ class PtyEndpoint(SimEndpoint):
         self._owner.received(data)
 
     def stick(self, *, on: bool) -> None:
-        """Stop or resume reading and the flow."""
+        """Stop or resume reading, and the terminal's output: while it is stopped, the host's writes block at once."""
         super().stick(on=on)
         if self._master >= 0:
             self._tcflow(self._slave, self._flow_off if on else self._flow_on)

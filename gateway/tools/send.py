@@ -105,7 +105,7 @@ def raw_bytes(text: str) -> bytes:
 
 
 def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
-    """Return the bytes of the frame. Raises WrongUse if it is not in the table, or if this car does not know it."""
+    """Return the bytes of the frame. Raises WrongUse if it is not a frame of the protocol, or unknown to this car."""
     frame = profile.parse_sent(raw_bytes(text))
     if frame is None:
         raise cli_support.WrongUse(f"frame {text!r}: {why_not(text)} (--raw sends it anyway)")
@@ -123,7 +123,7 @@ def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
 
 
 def why_not(text: str) -> str:
-    """Return the reason why a text is not a frame of the table, for a person."""
+    """Return the reason why a text is not a frame of the protocol, for a person."""
     if expanded := _EXPANDED.fullmatch(text):
         rest = expanded["rest"]
         # `$1`..`$4` are empty in a shell, `$0` is its name.

@@ -40,7 +40,7 @@ LINK_TIMEOUT_S: Final = 2.0
 """Time for which a question for tokens waits for a lost link. After 0.2 to 0.5 s a session has its link again."""
 _LINK_POLL_S: Final = 0.02
 _PROMPT_S: Final = 1.0
-"""Half the lease of a link. If an answer takes longer, the link may have ended before the answer was whole."""
+"""Half the lease of a link. If an answer takes longer, the link may have ended before the answer was complete."""
 _END_OF_LINK_S: Final = 0.1
 """Time within which a session notices that its link has ended."""
 

@@ -13,7 +13,7 @@ BRLTTY: Final = "brltty"
 
 
 def explain_missing_port(devices: Path | None = None) -> str:
-    """Return why a CH340 that is plugged in has no serial port, and what to type. Empty if no CH340 lacks its port."""
+    """Return why a CH340 that is plugged in has no serial port, and what to type. Empty if each CH340 has its port."""
     # brltty detaches the driver of the adapter some seconds after it was plugged in, so the port appears and vanishes.
     if not any(map(_is_without_port, _adapters(DEVICES if devices is None else devices))):
         return ""

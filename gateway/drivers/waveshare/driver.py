@@ -19,8 +19,8 @@ written.
 obeys. But it gives our readings an order: a feedback that arrives after the repeated stop was made after the stop. If
 its wheel speeds are measured, and are zero from then on for a quarter of a second, the car stands still. Measured means
 three things: the chassis has encoders, we have configured the car, and both wheels were seen to turn in a drive of ours
-since then, as an encoder with a loose wire reports zero for ever. Any other stop ends as `sent`, which claims only that
-its frames were written, and we rely on the timer.
+after that. The last is needed because an encoder with a loose wire reports zero for ever. Any other stop ends as
+`sent`, which claims only that its frames were written, and we rely on the timer.
 
 *Lost settings.* We would not notice a setting that was lost on the link. So the chassis and the dead-man time are sent
 until the car has repeated them. A car that repeats no line gets them three times if its feedback arrives at the
@@ -120,7 +120,8 @@ _SIDES: Final[Mapping[Motion, tuple[float, float]]] = {
 """Shares of the left and the right wheel."""
 _BOOT: Final = re.compile(rb"rst:0x|boot:0x|entry 0x|\bets [A-Z]")
 """Text of the ESP32's own boot program."""
-_OWN: Final = re.compile(rf'\{{"T":({"|".join(map(str, {*ALLOWED, 1005}))})[,}}]'.encode())  # late echo, servo error
+# The echo of one of our lines, which may come late, or a servo error (1005), which the car prints by itself.
+_OWN: Final = re.compile(rf'\{{"T":({"|".join(map(str, {*ALLOWED, 1005}))})[,}}]'.encode())
 
 
 class Setup(Enum):

@@ -42,15 +42,17 @@ class CarModel:
     evidence: StopEvidence = field(init=False)
     trust: TrustState = field(default_factory=TrustState)
     rest_case: StopCase = cases.SOFT
-    """The case of the last stop, if the claim that the car is at rest has the basis `sent`."""
+    """The case of the last stop (see `stops.cases`). It is used while the claim that the car is at rest has the basis
+    `sent`."""
     mode_closed_at: float = float("-inf")
     mode_left_by: float = float("-inf")
     """When the last `MODE00` that closes a mode was written, and the latest time at which the car has left the mode."""
     range_cm: float | None = None
-    """The last measured distance, and its time."""
+    """The last measured distance, and its time. The distance is None if the last ranging had no echo."""
     range_at: float = float("-inf")
     cut_write: bool = False
-    """True if a write has failed since the last recovery: the car may hold a string that only a color frame clears."""
+    """True if a write has failed since the last recovery. Then the car may hold half a frame, which only a color frame
+    clears."""
     missed_stop: bool = False
     """True if the time for the evidence of a stop on this link has run out, although the car reported meanwhile."""
     link_since: float = float("-inf")
@@ -117,7 +119,7 @@ class CarModel:
         return self.mode.why_quiet
 
     def unheard_s(self, now: float) -> float:
-        """Return how long the car has been silent, without the time for which our frames block it."""
+        """Return how long the car has been silent, without the time for which our frames kept it busy."""
         return self.mode.unheard_s(now)
 
     @property

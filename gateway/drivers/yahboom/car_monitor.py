@@ -170,8 +170,8 @@ class CarMonitor:
         model = self.model
         if model.platform.profile is model.profile or not model.link_open:
             return
-        # With a wrong head, the car ignores our named frames, and its readings cannot be read. So do not postpone a
-        # change of the head.
+        # The head is the first word of a named frame, such as `4WD` in `$4WD,PTZ90#`. With a wrong head, the car
+        # ignores our named frames, and its readings cannot be read. So do not postpone a change of the head.
         has_other_head = model.platform.profile.dialect.head != model.profile.dialect.head
         may_replace = has_other_head or (model.platform.open_mode and model.stop_style is StopStyle.BOTH)
         if not may_replace and not self._executor.accepts_commands(now):
@@ -179,9 +179,9 @@ class CarMonitor:
         before = model.profile.kind
         model.treat_as(model.platform.profile)
         words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
-        if model.platform.auto:  # else a contradiction has reported the corrected platform
+        if model.platform.auto:  # otherwise the log has the new platform already, in the warning of the contradiction
             self._log.log(Level.INFO, "platform_settled", words, now)
-        if has_other_head and self._is_idle:  # the frames of a drive have no head, so let a drive go on
+        if has_other_head and self._is_idle:  # motions are general frames, which have no head, so let a drive go on
             self._stops.recover(now, words)
         elif before not in (Platform.UNKNOWN, model.profile.kind):
             self._on_other_program(now, words)
@@ -214,7 +214,8 @@ class CarMonitor:
         model = self.model
         fan = model.believed.fan_may_run
         limit_s = model.mode.silence_limit(fan=fan)
-        # During a stop, silence shows nothing about the mode. But an expected silence must restart the clock even then.
+        # During a stop, silence shows nothing about the mode, so skip this. But if every silence is normal now (there
+        # is no limit), do not skip it: this silence must not count later.
         if self._stops.running is None or limit_s is None:
             model.mode.on_silence(now=now, fan=fan)
         model.mode.fade(now)
@@ -223,7 +224,8 @@ class CarMonitor:
         silent_s = model.mode.unheard_s(now)
         if silent_s <= model.mode.manual_silence_s or self._silent_since == model.mode.heard_at:
             return
-        was_heard = model.mode.heard_at > float("-inf") or model.learned.reporting  # here, or by an earlier gateway
+        # This gateway has heard the car, or an earlier one has.
+        was_heard = model.mode.heard_at > float("-inf") or model.learned.reporting
         if not was_heard and (found := model.platform.on_never_heard()):
             self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {found}", now)
             model.treat_as(model.platform.profile)

@@ -38,8 +38,8 @@ from schemas.commands import Verb
 from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
 
 STALE_TIMES_S: Final = 0.5
-"""Maximum gap of the loop. After a longer one, the times of reports do not count: a report that is only read late may
-look like one that shows a stop."""
+"""Maximum time for which our loop may stand still. After a longer one, the times of reports do not count: a report that
+is only read late may look like one that shows a stop."""
 
 
 class YahboomDriver(Executor):

@@ -197,7 +197,10 @@ class Executor(Driver):
 
     @property
     def _full_stop_runs(self) -> bool:
-        """Return True if a stop is running that is more than the end of a drive, and does not give way at once."""
+        """Return True if a full stop is running (not just the end of a drive) that does not give way at once.
+
+        A stop that repeats an earlier one counts only after all its frames are sent.
+        """
         running = self.stops.running
         if running is None or running.sequence.rank <= SOFT.rank:
             return False
@@ -217,7 +220,7 @@ class Executor(Driver):
         return waits and (self._stop_goes_first(now) or self._renewal_goes_first(now) or self._is_listening(now))
 
     def _renewal_goes_first(self, now: float) -> bool:
-        """Return True if a stream of actions has held up the renewal of a stop that the car has not shown."""
+        """Return True if a stream of actions has held up the renewal (repeat) of a stop that the car has not shown."""
         return self._renews and now >= self.stops.renewal.goes_first_at
 
     @property
@@ -229,7 +232,8 @@ class Executor(Driver):
     def _is_listening(self, now: float) -> bool:
         """Return True if a stream of actions has blocked the car for so long that it must send a report first.
 
-        A block excuses a silence. So during an endless stream nobody would notice a car that lost its stop and drives.
+        While our frames block a car, its silence counts as normal. So during an endless stream nobody would notice a
+        car that lost its stop and drives.
         """
         mode = self.model.mode
         if not self._has_stream_since(mode.heard_at):
@@ -379,7 +383,7 @@ class Executor(Driver):
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:
-        """Claim no longer that the car has shown its rest, because it may read half of a named frame as a motion.
+        """Claim no longer that the car has shown its stop, because it may read half of a named frame as a motion.
 
         A named frame has words, such as `$4WD,PTZ90#` (docs/reference/protocol.md#hazards).
         """

@@ -46,7 +46,7 @@ AWAKE_WAIT_S: Final = 1.25
 # and the two together can start the car (docs/reference/protocol.md#programs-that-people-have). So leave time for 20 ms
 # on the wire, 60 ms, and one report of 48 ms.
 NAMED_GAP_S: Final = 0.13
-"""Minimum time from any frame to a named one."""
+"""Minimum time from any frame to a named one, which has words, such as `$4WD,PTZ90#`."""
 
 
 class Gate(IntEnum):
@@ -114,7 +114,7 @@ class Pacing:
 
     @property
     def _interval_s(self) -> float:
-        """The interval of the reports with an echo, as far as it is known."""
+        """The interval of the reports with a sonar echo, as far as it is known."""
         expected_s, no_echo = self.profile.interval_s, self.learned.no_echo
         if no_echo.is_known:  # an interval without an echo is longer by the whole ranging
             expected_s = min(expected_s, no_echo.median_s - self.profile.ranging_s)

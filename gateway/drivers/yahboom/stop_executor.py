@@ -323,7 +323,8 @@ class StopExecutor:
                 self._handle_loss(running, now)
             case _:
                 pass
-        if finding is Finding.UNJUDGED:  # leave the next interval undisturbed, so that the rhythm can be learned
+        # Leave the next interval undisturbed, so that the rhythm (the usual interval of the reports) can be learned.
+        if finding is Finding.UNJUDGED:
             running.report_wait_s = stop_in_progress.report_wait_s(self.model.profile, self.model.learned, slowest=True)
             if self.model.learned.echo.is_known:  # the rhythm was known, but it is another one now
                 next_s = at - running.last_at + stop_in_progress.SLOWEST_S + stop_in_progress.REPORT_MARGIN_S

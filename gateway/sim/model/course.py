@@ -1,4 +1,4 @@
-"""The Raspberry Pi program of a course, with a table of exact frames. It ends at any other frame, and sends nothing.
+"""The Raspberry Pi program of a course. It knows a table of exact frames, ends at any other one, and sends nothing.
 
 The program was run (docs/reference/protocol.md#programs-that-people-have). Its speed, and the frames that it knows
 besides the motions, are assumptions.

@@ -1,6 +1,6 @@
 """Runs the programs of cars that affect each other, event by event in the order of time. Pure.
 
-So no program is ahead of another one when it reads its sensors.
+In this order, no program is ahead of another one when it reads its sensors.
 """
 
 from typing import Protocol

@@ -28,7 +28,7 @@ STM32_SPEED_STEP: Final = 100
 STM32_TOP_SPEED: Final = 1000
 SILENT_TURN_S: Final = 0.02
 """Time of one loop turn of a mode that prints nothing."""
-# The program does not know lights 5 to 7, and its lights 3 and 4 are swapped in comparison with the table.
+# The program does not know lights 5 to 7. Its lights 3 and 4 are swapped, compared with docs/reference/protocol.md.
 STM32_LIGHTS: Final = {"1": (255, 255, 255), "2": (255, 0, 0), "3": (0, 0, 255), "4": (0, 255, 0), "8": (0, 0, 0)}
 
 
@@ -167,7 +167,7 @@ class Stm32Car(ModeCar):
             self._send(self._arm_frame(self._joints))
         if "imu" in self._options:
             self._send(self._imu_frame())
-        # The main loop waits for each byte to leave, and does not read the buffer meanwhile.
+        # The main loop waits until each byte is sent, and does not read the buffer meanwhile.
         yield Wait(max(self._now, self._tx_free))
 
     def _turn(self, fields: str) -> Program:

@@ -51,7 +51,7 @@ KP: Final = 20.0
 KI_PER_TURN: Final = 200.0
 """Integral gain per step of the speed loop. A step takes SPEED_LOOP_S."""
 DEAD_DUTY: Final = 23.0
-"""A smaller duty counts as zero."""
+"""A smaller duty counts as zero. The duty is the power of a motor, -255..255."""
 _ROM: Final = b"ets Jul 29 2019 12:21:46\r\n\r\nrst:0x1 (POWERON_RESET),boot:0x13\r\nentry 0x400805e4\r\n"
 _SETUP: Final = (
     (0.3, b"INA219 initialized.\r\n"),
@@ -512,7 +512,8 @@ class UgvCar:
             yaw = round(degrees(self._body.pose(now).heading_rad), 2)
             fields = {"T": 1001, **wheels, "r": 0.4, "p": -0.2, "y": yaw, "temp": 41.5, "v": round(volts, 2)}
         if self._module == 1:
-            # A real car sends such a name twice, the second time with the position of the arm. The last value counts.
+            # With an arm, a real car sends these names twice, the second time with the position of the arm. The last
+            # value counts.
             places = [f"a{each}" for each in "xyz"] if self._build.is_ros else list("xyz")
             fields |= dict(zip(places, (310.2, -194.1, 228.6), strict=True)) | {"torB": -56, "torS": 12}
         elif self._module == 2:

@@ -9,8 +9,8 @@ loses or holds a report, the interval is wrong, so an interval is added to the r
 three in a row fit each other but not the rhythm, they are a new rhythm: the car runs another program, or it is another
 car.
 
-A *delay* is how much later than the rhythm a report comes after one frame that may block. A car that blocks
-acknowledges each such frame with its delay. A car that reports by a timer never does.
+A *delay* is how much later than the rhythm a report comes after one frame that may block the car. The delay is the only
+acknowledgement of the frame. A car that reports by a timer is never late, so it acknowledges nothing.
 
 The finding that a car cannot show a stop needs more than a first impression: `UNREACTED` blocking frames without any
 delay, and none with a delay. It is withdrawn after `REACTED` delays that are as long as the block of a frame. No frame
@@ -147,6 +147,7 @@ class Learned(Struct):
     echo: Rhythm = field(default_factory=Rhythm)
     """The rhythm of reports of mode 0 with a sonar echo."""
     no_echo: Rhythm = field(default_factory=Rhythm)
+    """The rhythm of reports of mode 0 without an echo."""
     shows: Shows = Shows.UNKNOWN
     doubted: bool = False
     """True if the car has shown its stops before, and did not show the last one."""

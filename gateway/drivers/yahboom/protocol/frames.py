@@ -19,7 +19,7 @@ COLOR_MAX: Final = 255  # docs/reference/protocol.md#named-frames: color LED 0..
 
 
 class EncodeError(ValueError):
-    """A value that the table does not allow. The message names the field, the value and the range."""
+    """A value that docs/reference/protocol.md does not allow. The message names the field, the value and the range."""
 
 
 class Dialect(Struct, frozen=True):
@@ -97,7 +97,7 @@ Frame = General | Ptz | ColorLed | ModeOpen | ModeClose | ArmSet | Reset
 
 
 def encode(frame: Frame, dialect: Dialect = STANDARD) -> bytes:
-    """Return the bytes of a frame. Raises EncodeError for a value that the table does not allow."""
+    """Return the bytes of a frame. Raises EncodeError for a value that the protocol does not allow."""
     match frame:
         case General():
             return _encode_general(frame, dialect)
@@ -129,7 +129,7 @@ def _encode_named(frame: Ptz | ColorLed | ModeOpen | ModeClose | ArmSet) -> byte
 
 
 def parse_sent(data: bytes, dialect: Dialect = STANDARD) -> Frame | None:
-    """Return the frame with these bytes. None if they are not one whole frame of the table.
+    """Return the frame with these bytes. None if they are not one whole frame of the protocol.
 
     Rotation takes precedence over place 1, as in the car. Return None also for frames that a `Frame` cannot express:
     MODE01, and a servo that moves (place 5) and resets (place 9) at once.

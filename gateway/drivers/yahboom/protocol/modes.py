@@ -62,7 +62,7 @@ _AVOIDING: Final = re.compile(rb"\$[0-9A-Za-z]+,CSB(?!120,)[0-9]+,PV8\.3,GS000,L
 MODES: Final[Mapping[Mode, ModeRow]] = {
     # mode 0 is never opened; its report takes 1.0 s if the ranging gets no echo
     Mode.MANUAL: ModeRow(0, 0.0, 1.0, rate_hz=1.0, measures=EVERY_MEASUREMENT),
-    # the table has no turn time for this mode: assumed as in the modes that only read pins
+    # docs/reference/protocol.md has no turn time for this mode: assumed as in the modes that only read pins
     Mode.REMOTE_CONTROL: ModeRow(1, _open_s(1), 0.1),
     Mode.TRACKING: ModeRow(2, _open_s(2), 0.1, 27.0, frozenset({"line"}), _signature(_TRACKING)),
     # near an obstacle, a turn takes 4.3 s; without any echo it never ends, and the motors are braked

@@ -84,7 +84,7 @@ class SpeedModel(Struct, frozen=True):
 ARDUINO_SPEED: Final = SpeedModel(start=150, increment=50, low=50, rebound=100, top=255)
 # programs that people have: 200 of 1000, steps of 100. The slowest speed was not measured: one step is assumed
 STM32_SPEED: Final = SpeedModel(start=200, increment=100, low=100, rebound=100, top=1000)
-# platforms: speed. Raspberry Pi +-20 in 20..100 %; the table has no start value: half of full speed is assumed
+# platforms: speed. Raspberry Pi +-20 in 20..100 %; the docs have no start value: half of full speed is assumed
 RASPBERRY_PI_SPEED: Final = SpeedModel(start=50, increment=20, low=20, rebound=20, top=100)
 
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters

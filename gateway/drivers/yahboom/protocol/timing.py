@@ -38,7 +38,7 @@ def block_s(frame: Frame, *, fan_s: float = 0.0) -> float:
         case General():
             parts = ((frame.whistle, WHISTLE_S), (frame.servo, SERVO_S), (frame.fan, fan_s))
             return max(FRAME_S, sum(block for active, block in parts if active))
-        case Ptz() | ArmSet():  # the table has no row for the arm: assumed as one servo
+        case Ptz() | ArmSet():  # docs/reference/protocol.md has no row for the arm: assumed as one servo
             return SERVO_S
         case ColorLed():
             return COLOR_S
@@ -46,5 +46,5 @@ def block_s(frame: Frame, *, fan_s: float = 0.0) -> float:
             return MODES[mode].open_s
         case ModeClose():
             return MODE_CLOSE_S
-        case Reset():  # the table has no row for a lone `#`: assumed as a stop, because it acts as one
+        case Reset():  # docs/reference/protocol.md has no row for a lone `#`: assumed as a stop, because it acts as one
             return FRAME_S

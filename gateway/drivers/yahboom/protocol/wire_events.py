@@ -20,7 +20,10 @@ class ArmReading(Struct, frozen=True):
 
 
 class ImuReading(Struct, frozen=True):
-    """Gyro and acceleration x, y, z in raw counts (the table gives no unit). `at` is the time of the last byte."""
+    """Gyro and acceleration x, y, z in raw counts (docs/reference/protocol.md gives no unit).
+
+    `at` is the time of the last byte.
+    """
 
     raw: bytes
     at: float

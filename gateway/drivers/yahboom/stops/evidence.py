@@ -471,7 +471,8 @@ class StopEvidence(Struct):
         self._mode_00_at = None
         first_delay_s, self._first_delay_s = self._first_delay_s, None
         if first_delay_s is not None and self._count_other_delay(first_delay_s):
-            # This car blocks for another time than expected. The equal delays before this one were block gaps, too.
+            # The block of this car has another length than expected. The equal delays before this one were block gaps,
+            # too.
             self._block_gaps = self._gaps_needed
             return self._count_gap(at, first_delay_s)
         # The interval is not a block gap. If the rhythm is not firm yet, let it become firm before the next `MODE00`.

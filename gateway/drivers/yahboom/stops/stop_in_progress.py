@@ -1,6 +1,6 @@
-"""Chooses the stop for a context, computes its worst case, and tracks a stop in progress.
+"""Chooses the stop for the state of a car (`StopContext`), computes its worst case, and tracks a stop in progress.
 
-`sequences` has the frames.
+The worst case is the longest time until the motors are off. `sequences` has the frames.
 """
 
 from typing import Final
@@ -21,9 +21,9 @@ from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
 from schemas.words import FrameOrigin, Mode, Platform
 
 WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
-RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory never longer outside avoidance
+RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory the maximum, except in obstacle avoidance
 _AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
-"""A car in an unknown state may be avoiding obstacles; assume the worst."""
+"""Longest turn of obstacle avoidance. A car in an unknown state may be in this mode, whose turns are the longest."""
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After that the command fails."""
 EVIDENCE_INTERVALS: Final = 5
@@ -33,8 +33,9 @@ after them. The maximum of the timeout is `MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case that is added to the timeout for the evidence, so that nobody waits longer than 17 s for an
 answer, or 23 s with the slowest car."""
-# The silence between two tries is longer than any block outside avoidance, so the car reads the next frame alone. With
-# an increase up to 6.5 s, the car reads at least one of two tries within 15 s after the end of a fault.
+# The silence between two tries is longer than any block outside obstacle avoidance, so the car reads the next frame
+# alone. The silence becomes 6.5 s at most, so the car reads at least one of two tries within 15 s after the end of a
+# fault.
 RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
 """Intervals from `MODE00` to the next try, by the number of tries."""
 SLOWEST_S: Final = 3.0
@@ -165,7 +166,7 @@ class StopInProgress(Struct):
     """True if the car had shown that it stands still before it fell silent. Then it gets only general stops: unlike a
     named frame, a general stop that loses bytes cannot start the motors."""
     case: StopCase = cases.MANUAL
-    """The case of the stop, if the car does not show it."""
+    """The case of the stop: it decides when the stop may end if the car does not show it."""
 
     @property
     def frames_sent(self) -> bool:
