@@ -1,4 +1,9 @@
-"""Builds, parses and checks keys, key expressions and names. Pure. `topics` lists the topics under the keys."""
+"""Builds, parses and checks keys, key expressions and names. Pure. `topics` lists the topics under the keys.
+
+A key is the address of a message on the Zenoh bus, such as `fleet/red/sensor/range`: chunks with slashes between them.
+A key expression is a key that may have wildcards, such as `fleet/*/sensor/range`. A liveliness token is a key that
+others can see on the bus while the program that declared it is connected.
+"""
 
 import re
 from typing import Final, NamedTuple

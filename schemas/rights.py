@@ -4,6 +4,9 @@ Gateway, console and coordinator use the same rules. A gateway makes its `Author
 the `state/safety` that the gateway publishes. Only the gateway decides; the others show in advance what it would
 answer.
 
+A hold keeps the coordinator from moving a stopped car, a loan gives the car to one person, and a lease says who
+controls the car now. A lead is a person with more rights than the others, such as a teacher.
+
 Without people in the fleet file, every person may drive every car, and nobody is a lead. These rules take the name of
 a sender as true (`identity` checks it on a hub with certificates). A stop or an e-stop needs no right.
 """

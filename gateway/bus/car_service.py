@@ -1,5 +1,7 @@
 """The bus service of one car: its queryables, its drive subscription, its token, and the check for a second gateway.
 
+A queryable answers queries. The token shows others that the gateway is connected (see `schemas.keys`).
+
 The gateway declares the service before it imports the rest of its modules, because these imports take half of the time
 of its start. So the car is on the bus early, and queries wait for `attach`. Do not import heavy modules here.
 

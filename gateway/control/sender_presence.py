@@ -1,4 +1,7 @@
-"""Tracks senders: whose liveliness token is lost, and who must send no drive for a while after a stop."""
+"""Tracks senders: whose liveliness token is lost, and who must send no drive for a while after a stop.
+
+A sender may have a liveliness token on the bus, which disappears with its connection (see `schemas.keys`).
+"""
 
 from typing import Final
 

@@ -1,4 +1,8 @@
-"""The only place that opens a Zenoh session: publications, subscriptions, queries and liveliness tokens."""
+"""The only place that opens a Zenoh session: publications, subscriptions, queries and liveliness tokens.
+
+A queryable answers the queries for its keys. A liveliness token is a key that others can see while its session is
+connected. A watch reports which tokens appear and disappear.
+"""
 
 import atexit
 import itertools
@@ -40,7 +44,8 @@ LINK_TIMEOUT_S: Final = 2.0
 """Time for which a question for tokens waits for a lost link. After 0.2 to 0.5 s a session has its link again."""
 _LINK_POLL_S: Final = 0.02
 _PROMPT_S: Final = 1.0
-"""Half the lease of a link. If an answer takes longer, the link may have ended before the answer was complete."""
+"""Half the lease of a link: a link that is silent for the whole lease has ended. If an answer takes longer than this,
+the link may have ended before the answer was complete."""
 _END_OF_LINK_S: Final = 0.1
 """Time within which a session notices that its link has ended."""
 
