@@ -230,7 +230,7 @@ class Executor(Driver):
         return model.at_rest and not model.trust.shown and self.stops.running is None
 
     def _is_listening(self, now: float) -> bool:
-        """Return True if a stream of actions has blocked the car for so long that it must send a report first.
+        """Return True if a stream of actions has blocked the car for too long: it must first send a report again.
 
         While our frames block a car, its silence counts as normal. So during an endless stream nobody would notice a
         car that lost its stop and drives.

@@ -28,8 +28,8 @@ from each other.
 either, each `MODE00` seems to make a block gap, for ever. Often the length of the interval shows whether a report was
 lost or the car was blocked. But a block of about a whole number of intervals looks like lost reports. In this case the
 gateway writes a *control*: a general stop, a third of an interval after a report. It does not block, so the next report
-must come on time. Suppose that the link made the block gaps: after each write it is mute for so long that it loses the
-next report. Then it is mute for as long after the general stop, and loses the report after that, too, however much the
+must come on time. Suppose that the link made the block gaps: after each write it is mute until it has lost the next
+report. Then it is mute for the same time after the general stop, and loses the report after that, too, however much the
 intervals differ. So if that report is missing or damaged, the link made the block gaps.
 
 *Why silence must follow.* A link that holds reports makes intervals of any length. But only the held report comes late.
