@@ -1,7 +1,8 @@
 """Suggests to users what to type instead: the name that was meant, or how to install an extra. Pure.
 
-There is one rule: a name is near a word if few letters differ, or if the name or a part of it begins with the word. A
-name that is only somewhat like the word is never suggested: whoever types `parking` does not mean `tracking`.
+A name is near a word if few letters differ, if the name or a part of it begins with the word, or if the word begins
+with the whole name, such as `tracking mode`. A name that is only somewhat like the word is never suggested: whoever
+types `parking` does not mean `tracking`.
 """
 
 import re
@@ -9,10 +10,11 @@ from collections.abc import Iterable
 from typing import Final
 
 _LETTERS_PER_FAULT: Final = 3
-"""For every three letters of a word, one letter may be wrong, missing, extra or swapped. In a shorter word, one may
-be."""
+"""For every three letters of a word, one letter may be wrong, missing, extra or swapped. A word of two letters may have
+one such fault, too, and a single letter none."""
 _MIN_PART_LENGTH: Final = 3
-"""Minimum length of a word that is looked for at the beginning of parts of names."""
+"""Minimum length of a word that is compared with the beginning of each part of a name. A shorter word is compared only
+with the beginning of the whole name."""
 _NO_WORD: Final = re.compile(r"[^a-z0-9]+")
 
 

@@ -443,7 +443,7 @@ class Fleet:
             command.inbox.put((time.monotonic(), QueryEnded(target, why_silent)))
 
     def _query_supervisor(self, command: PendingCommand) -> None:
-        """Ask the supervisor for which cars it runs gateways, and queue their names. Runs on a thread of the pool."""
+        """Ask the supervisor whose gateways it runs, and queue the names of these cars. Runs on a pool thread."""
         names: set[str] = set()
         try:
             for status in ask_status(self.bus, self.name, ANSWER_TIMEOUT_S):

@@ -61,7 +61,7 @@ def check_car(name: str) -> str:
 
 
 class KeyCondition(Struct, frozen=True):
-    """A condition on one reading. Each message type that has the fields has its own expression."""
+    """A condition on one reading. Each message type that has all fields of the condition has its own expression."""
 
     text: str
     by_message: Mapping[str, Expression]
@@ -120,5 +120,5 @@ def _check_with_all_fields(
     aliases: dict[str, str] = {}
     for message, each in fields_of_message.items():
         aliases |= topic_aliases_of(topic_names[message], each)
-    # The error lists the names in this order, so put the fields of every message last.
+    # The error lists the names in this order, so put the fields that all messages have (`LAST`) at the end.
     parse(text, {name: fields[name] for name in sorted(fields, key=LAST.__contains__)}, aliases)

@@ -1,4 +1,4 @@
-"""Adds the options that select a fleet to the commands that messages propose. Pure.
+"""Completes the commands that messages propose: adds the options with which the user selects a fleet. Pure.
 
 Messages propose commands in backticks, such as `fleet stop red`. The messages come from gateways, services and this
 computer. Only the command that prints a message knows with which options its user reaches the fleet.

@@ -17,13 +17,13 @@ from fleet.console.page_link import SEND_TIMEOUT_S
 PIECE_BYTES: Final = 1024
 """Bytes that are parsed at a time: some thirty of the smallest messages."""
 CLOSED_INTERVAL_S: Final = 0.01
-"""Interval at which pieces are parsed after the page was closed. Only the page's answer to the closing still
-matters."""
+"""Interval at which pieces are parsed after the console has closed the WebSocket. Then only the page's answer to the
+closing matters, so the rest of the page's bytes may wait."""
 CLOSE_TIMEOUT_S: Final = 2.0
-"""Timeout of the answer to the closing. A page that floods may never read that it was closed."""
+"""Timeout for the page's answer to the closing by the console. A page that floods may never read the closing."""
 WRITE_BUFFER_BYTES: Final = 64 * 1024
-"""Maximum number of bytes that wait for a page that does not read. Further messages have to wait. asyncio's limit for
-TLS is 512 KiB."""
+"""Maximum number of bytes that wait for a page that does not read. Further messages have to wait. It is smaller than
+asyncio's own limit for TLS, which is 512 KiB for each page."""
 
 
 class FairWebSocket(WebSocketsSansIOProtocol):
@@ -69,8 +69,8 @@ class FairWebSocket(WebSocketsSansIOProtocol):
     async def send(self, message: ASGISendEvent) -> None:
         """Send a message. If it closes the WebSocket, make sure that the connection ends."""
         await super().send(message)
-        # If the peer goes while reading is paused, asyncio's TLS forgets the connection. The place of the connection
-        # would never become free.
+        # If the page disappears while reading is paused, asyncio's TLS forgets the connection. Then it would count
+        # against the limit of open connections for ever.
         if message["type"] == "websocket.close":
             self._end_later()
 
@@ -89,7 +89,7 @@ class FairWebSocket(WebSocketsSansIOProtocol):
             self._full = None
 
     def handle_ping(self) -> None:
-        """Answer a ping, and count it as a message.
+        """Answer a ping, and count it as a message, because the console limits how many messages a page may send.
 
         Do not answer if the page reads nothing, because answers would pile up.
         """
@@ -124,7 +124,8 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         if self._rest and not self.read_paused:
             self.read_paused = True
             self.transport.pause_reading()
-        # If no message came out, the piece had only pings, or a part of a message.
+        # A piece may yield no message: it has only a part of one, or the answer to our ping, or the console has closed
+        # the WebSocket. So parse the next piece soon.
         if self._rest and self.queue.empty() and not self.transport.is_closing():
             self._waits = True
             self.loop.call_later(CLOSED_INTERVAL_S if self.close_sent else 0.0, self._parse)

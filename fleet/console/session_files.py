@@ -1,4 +1,4 @@
-"""The sessions folder for the pages: the names that are sessions, and a session as a stream of bytes."""
+"""The sessions folder for the pages: finds the session of a name, and yields its files as a stream of bytes."""
 
 import zipfile
 from collections.abc import Iterator

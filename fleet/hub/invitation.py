@@ -1,7 +1,8 @@
 """Lets one other computer join the hub, once, within ten minutes: the server on the hub's side, and the client.
 
-The client makes its own key, and the key never leaves the client. The client sends a request for a certificate, with
-the secret half of the code. The hub decides which identity the certificate gets.
+The client makes its own key, and the key never leaves the client. The code of an invitation has two halves: a secret,
+and a pin that identifies the hub. The client sends a request for a certificate, with the secret half. The hub decides
+which identity the certificate gets.
 """
 
 import base64
@@ -44,7 +45,7 @@ class NotJoined(BusError):
 
 
 class NotThisHub(NotJoined):
-    """No hub answers there, or a hub that did not make the code."""
+    """No hub answers there, or the hub there did not make the code."""
 
 
 class Joined(Struct, frozen=True):
@@ -237,9 +238,10 @@ def join_one_of(
     addresses: Iterable[str] = (),
     own_authority: Callable[[bytes], bool] = lambda _: False,
 ) -> tuple[str, Joined]:
-    """Join the hub that made a code, and return its host, too. found: host:port of any hubs. Raises NotJoined.
+    """Join the hub that made a code. Return that hub's host, and what it gave. Raises NotJoined.
 
-    The code is sent only to the hub that made it. The other arguments are as for `join`.
+    found: host:port of each hub to try. The code is sent only to the hub that made it. The other arguments are as for
+    `join`.
     """
     own, tried = list(addresses), 0
     for each in found:

@@ -82,8 +82,8 @@ class PinList(Struct):
 
 
 def _is_of_one_cause(one: Pin, other: Pin) -> bool:
-    # Pins of stops are merged even if their words differ, because these name the sender. The merged pin keeps the first
-    # words.
+    # The words of a stop's pin name the sender, so they differ between stops of two people. Merge these pins all the
+    # same. The merged pin keeps the first words.
     return one.cause == other.cause and (one.cause != PinCause.CONDITION or one.words == other.words)
 
 

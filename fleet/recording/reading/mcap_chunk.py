@@ -22,14 +22,14 @@ from fleet.recording.reading.mcap_index import HEAD, MAX_RECORD_BYTES
 _MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 MAX_CHUNK_BYTES: Final = 2**30
 MAX_RATIO: Final = 64
-"""Limits of a decompressed chunk that is larger than MAX_RECORD_BYTES, so that a few bytes cannot fill the memory.
-Readings compress by a factor of 3 to 20."""
+"""Limits for a chunk that is larger than MAX_RECORD_BYTES when decompressed: its size then, and how many times the
+compressed size that is. So a few bytes cannot fill the memory. Readings compress by a factor of 3 to 20."""
 # Errors that the mcap library and the decompressors raise for corrupted bytes.
 BROKEN: Final = (McapError, ValueError, struct.error, zstandard.ZstdError, RuntimeError, MemoryError, OverflowError)
 
 Record = tuple[int, int, int, int, bytes]
-"""A message is channel, sequence, log time, publish time, payload. A channel or schema is minus its opcode, 0, 0, 0,
-body: a negative first number is no message."""
+"""A message is (channel, sequence, log time, publish time, payload). A channel or schema is (-opcode, 0, 0, 0, body):
+the negative first number shows that it is not a message."""
 
 
 class Damage(Struct, frozen=True):
@@ -78,7 +78,8 @@ class ChunkPart(Struct, frozen=True):
                     raise EndOfFile
                 if opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
                     body = data[begin:at]
-                    # Parse the record here, too, so that a chunk with one corrupted record yields no message at all.
+                    # Parse the record already here, although only its body is returned. So a chunk with one corrupted
+                    # record yields no message at all.
                     (Channel if opcode == Opcode.CHANNEL else Schema).read(ReadDataStream(BytesIO(body)))
                     found.append((-opcode, 0, 0, 0, body))
         return found

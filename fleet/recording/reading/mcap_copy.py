@@ -12,14 +12,14 @@ from mcap.writer import LIBRARY_IDENTIFIER, Writer
 from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, Row
 
 SESSION_METADATA: Final = "session"
-"""Name of the metadata record that names the session of which a file is a part."""
+"""Name of the metadata record that says to which session a file belongs."""
 CHUNK_NS: Final = 1_000_000_000
 """Maximum time span of a chunk, as in the recorder's files. So reading a short part decompresses little more than that
 part."""
 
 
 class McapCopy:
-    """One file to write. Every method may raise OSError. After an exception the file stays truncated."""
+    """One file to write. Every method may raise OSError. After an exception, the file stays without its end."""
 
     def __init__(self, path: Path, about: Mapping[str, str] | None = None) -> None:
         self._file = path.open("xb")
@@ -49,7 +49,8 @@ class McapCopy:
     def add(self, row: Row) -> None:
         """Write one message unchanged."""
         info, sequence, log_ns, publish_ns, data = row
-        # Channels are looked up by identity, which is fast. The stored object keeps its id from being reused.
+        # A ChannelInfo is looked up by its Python id, which is fast. It is stored, too, so that no other object gets
+        # this id.
         entry = self._channel_ids.get(id(info))
         if entry is None:
             entry = self._channel_ids[id(info)] = (info, self._channel(info))

@@ -1,8 +1,8 @@
-"""Finds the stops of a session that a car did not show, or that did not reach it: car, time and cause. Pure.
+"""Finds the failed stops of a session: those that a car did not show, and those that did not reach a car. Pure.
 
 A gateway records such a stop twice: as the last event of each command that asked for it, and in its log. Both have the
 same words, so they become one finding here. The likely cause is in the last states before the stop: a lost link, a car
-in doubt, or a car whose reports cannot show a stop.
+that did not show an earlier stop, or a car whose reports cannot show a stop.
 """
 
 from collections.abc import Iterator

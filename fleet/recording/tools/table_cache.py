@@ -1,15 +1,15 @@
 """Stores the tables of a session as Parquet beside it, for SQL questions about many sessions.
 
-The tables for one state of a session are in the directory `.tables-<digest>`. The digest covers the session's files
-with their sizes and times, their description, and the columns of our tables. So a session that grew gets a new
-directory, and the old one is deleted. A directory gets its name only when it is complete: if two questions make it at
-the same time, one of the two is kept. Deleting a directory costs only time. A table whose columns are not those of this
-version is named `.foreign.parquet`.
+The tables for one state of a session are in the directory `.tables-<digest>`. The digest covers the sizes and times of
+the segments, what the session's description says about the messages, and the columns of our tables. So a session that
+grew gets a new directory, and the old one is deleted. A directory gets its name only when it is complete: if two
+questions make it at the same time, one of the two is kept. Deleting a directory costs only time. A table whose columns
+are not those of this version is named `.foreign.parquet`.
 
 Reading the descriptions of a thousand sessions takes as long as a question. So a directory has a stamp: an empty file
 whose name covers the sizes and times of all files and of the description. While the stamp fits, the description is not
-read. After a new mark it does not fit: then the description is read, and if it says nothing new about the messages,
-only the stamp is replaced.
+read. A new mark changes the description, so the stamp no longer fits, and the description is read. If it says nothing
+new about the messages, the tables stay, and only the stamp is replaced.
 """
 
 import errno
@@ -53,8 +53,8 @@ _NOTE: Final = "damage"
 """Name of the file that describes the parts of the session that could not be read."""
 _FOREIGN: Final = ".foreign.parquet"
 _OPEN: Final = "recording"
-"""Name of the empty file that says that the session was being recorded when its tables were made. If the recorder has
-not closed the session since, it was cut."""
+"""Name of the empty file that says that the recorder had not closed the session when its tables were made. If it
+still has not, the session was cut short, so its losses are looked up again."""
 _LEFT_OUT: Final = "left_out"
 """Name of the file with the messages that are not in the table of their key: a list of key, cause and count."""
 _STAMP: Final = "stamp-"
@@ -242,7 +242,7 @@ def _drop_stale_parts(home: Path) -> None:
 def _drop_others(place: Path) -> None:
     """Delete the tables of other states of the session.
 
-    A file that another question is reading is deleted next time.
+    A file that cannot be deleted, for example because another question is reading it, is deleted next time.
     """
     for other in place.parent.glob(f"{TABLES_PREFIX}*"):
         if other != place and not other.name.endswith(_PART):

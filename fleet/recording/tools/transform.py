@@ -59,7 +59,8 @@ def recover(session: Session, out: Path, with_progress: Progress = iter) -> tupl
     """
     with atomic_directory(out) as new:
         count = _copy(with_progress(session.rows()), new, session)
-        # Get the damage after reading, because then it names the lost times. A check of all CRCs would add nothing.
+        # Get the damage only now: reading finds it, and can say which times were lost. A check of all CRCs would add
+        # nothing.
         words = "; ".join(filter(None, (session.damage_words, session.lost_extras)))
         if not count:
             raise NoSession(f"{session.path} has no intact message: {words or 'it is empty'}")

@@ -40,11 +40,11 @@ QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
 machine."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
 GAP_MARGIN_S: Final = 2.0
-"""Margin of a window for two delays of the network: that of the last message before the gap, and that of the query. A
-publisher counts the window back from the arrival of the query."""
+"""Margin of a window for two delays of the network. The last message before the gap was published before it arrived, so
+the gap may begin earlier than that. And the publisher counts the window back from the late arrival of the query."""
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
-"""Number of polls in 2 s, after which Zenoh takes a silent hub for dead (its lease). Counted in polls, because a
-stalled process does not poll."""
+"""Number of polls in 2 s. This is Zenoh's lease: only a silence of this time shows that a link is lost, so messages may
+be missing since its beginning. Counted in polls, so that a stall of this process makes the window longer."""
 MAX_SINGLE_KEYS: Final = 16
 """Maximum number of keys to query one by one. If there are more, query everything."""
 MAX_ANSWERS: Final = 200_000
