@@ -22,7 +22,7 @@ import zenoh
 from msgspec import Struct, field
 
 from gateway import drivers
-from gateway.bus.car_publisher import BUS_LOSS_GAP_S, CarPublisher, findings_of
+from gateway.bus.car_publisher import BUS_LOSS_GAP_S, CarPublisher
 from gateway.bus.car_service import AlreadyServed, CarService
 from gateway.bus.command_handler import CommandHandler
 from gateway.bus.estop_sync import EstopSync
@@ -161,7 +161,6 @@ class CarGateway:
         self._began_at = self._alive_at = now
         self._learned_due_at = now
         self._worst_lag_s = 0.0
-        self._published_findings: tuple[object, ...] = ()
 
     async def run(self) -> bool:
         """Serve the car until `stop`, then until the car has stopped. Return False if it could not be stopped.
@@ -386,12 +385,11 @@ class CarGateway:
 
     def _publish_states(self, now: float, *, force: bool = False) -> None:
         """Publish changed states. Before them, publish a new finding about the car, because the states rest on it."""
-        if findings_of(self._driver.model) != self._published_findings:
+        if self._publisher.has_new_findings:
             self._publish_health(now)
         self._publisher.publish_states(self._control, self._link.health, now, force=force)
 
     def _publish_health(self, now: float) -> None:
-        self._published_findings = findings_of(self._driver.model)
         drops = self._service.dropped + self._publisher.dropped
         self._publisher.publish_health(now, loop_lag_s=self._worst_lag_s, bus_drops=drops)
 

@@ -64,7 +64,9 @@ class CarPublisher:
         self._published_states: dict[str, tuple[object, ...]] = {}
         self._published_at: dict[str, float] = {}
         self._shown: tuple[object, ...] = ()
-        """`shown_state` when the states were last published."""
+        """`_shown_state` when the states were last published."""
+        self._findings: tuple[object, ...] = ()
+        """`_findings_of` the car when its health was last published."""
         for topic in topics.CAR_TOPICS:
             if topic.family == "sim":
                 continue
@@ -207,7 +209,12 @@ class CarPublisher:
     @property
     def is_outdated(self) -> bool:
         """True if a reading or a silence has changed a state since the last `publish_states`."""
-        return shown_state(self._driver.model) != self._shown
+        return _shown_state(self._driver.model) != self._shown
+
+    @property
+    def has_new_findings(self) -> bool:
+        """True if a finding about the car has changed since the last `publish_health`."""
+        return _findings_of(self._driver.model) != self._findings
 
     def publish_states(
         self, control: Controller[Driver], health: LinkHealth, now: float, *, force: bool = False
@@ -215,7 +222,7 @@ class CarPublisher:
         """Publish each state that changed, and all of them once a second."""
         model, safety = control.driver.model, control.safety
         mode = model.mode
-        self._shown = shown_state(model)
+        self._shown = _shown_state(model)
         lease = safety.lease_at(now)
         changes: dict[str, tuple[object, ...]] = {
             "state/link": (health.state, health.reconnects, health.state is LinkState.LOST and health.reason),
@@ -264,6 +271,7 @@ class CarPublisher:
         message.loop_lag_s = loop_lag_s
         message.bus_drops = bus_drops
         _fill_findings(message, model)
+        self._findings = _findings_of(model)
         self._put_state("state/health", message, now)
 
     def _put_state(self, name: str, message: Any, now: float) -> None:
@@ -350,14 +358,14 @@ def _fill_mode(message: pb.Mode, control: Controller[Driver], now: float) -> Non
     message.candidates.extend(mode.candidates)
 
 
-def findings_of(model: DriverClaims) -> tuple[object, ...]:
+def _findings_of(model: DriverClaims) -> tuple[object, ...]:
     """Return the findings about the car itself: its profile, and whether its readings show its stops."""
     return model.profile.name, model.shows, model.doubted
 
 
-def shown_state(model: DriverClaims) -> tuple[object, ...]:
+def _shown_state(model: DriverClaims) -> tuple[object, ...]:
     """Return the part of the published states that readings or silence may change."""
-    return model.mode.verdict, model.mode.inferred, model.motors, model.basis, *findings_of(model)
+    return model.mode.verdict, model.mode.inferred, model.motors, model.basis, *_findings_of(model)
 
 
 def _fill_motion(message: pb.Motion, control: Controller[Driver], now: float) -> None:
