@@ -42,7 +42,7 @@ def of_iso(text: str) -> str:
 
 
 def with_offset(at_ns: int) -> str:
-    """Return a time in ISO 8601 with milliseconds and the local zone's offset: commands accept it again."""
+    """Return a time in ISO 8601 with milliseconds and the local zone's offset, as commands accept it."""
     if not _is_date(at_ns / _NS):
         return f"{at_ns} ns"
     seconds, rest = divmod(at_ns, _NS)
@@ -50,9 +50,10 @@ def with_offset(at_ns: int) -> str:
 
 
 def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
-    """Return when a local time of day (`14:05`, `14:05:12`) begins on each day from `start_ns` to `end_ns`.
+    """Return when a local time of day begins on each day from `start_ns` to `end_ns`, in ns since the epoch.
 
-    Leave out times that are over at `start_ns` or begin after `end_ns`. Return None if the text is not a time of day.
+    A time of day is a minute (`14:05`) or a second (`14:05:12`). Leave out those that are over at `start_ns` or begin
+    after `end_ns`. Return None if the text is not a time of day.
     """
     found = _CLOCK.fullmatch(text)
     if found is None or int(found[1]) > 23 or int(found[2]) > 59 or int(found[3] or 0) > 59:
@@ -69,7 +70,7 @@ def clock_begins(text: str, start_ns: int, end_ns: int) -> list[int] | None:
 
 
 def clock_length_ns(text: str) -> int:
-    """Return how long a typed time of day lasts, ns: a minute if it has no seconds (`14:05`), else a second."""
+    """Return the length of a typed time of day in ns: a minute if it has no seconds (`14:05`), else a second."""
     return (60 if text.count(":") == 1 else 1) * _NS
 
 

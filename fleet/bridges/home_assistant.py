@@ -12,8 +12,8 @@ gone or is silent, or whose link is lost. The bridge has an availability of its 
 if the bridge's connection breaks (the bridge's last will). An entity is available only if the car and the bridge are.
 
 **After a crash,** the broker still has what the bridge had retained: the announcements, and `online` for its cars. The
-next bridge reads these messages when it begins (`adopt`), and publishes `offline` for cars that are not on the bus. A
-bridge that ends normally removes them all, so Home Assistant forgets the devices.
+next bridge reads what is kept as availability when it begins (`adopt`), and publishes `offline` for cars that are not
+on the bus. A bridge that ends normally removes all these messages, so Home Assistant forgets the devices.
 """
 
 import json
@@ -229,7 +229,7 @@ class HomeAssistant:
             yield from self._announcement(car, available=available)
 
     def news(self, states: Mapping[str, CarState], now: float) -> Iterator[Publication]:
-        """Yield what has changed since the last call. `states` are the cars that are known."""
+        """Yield what has changed since the last call. `states` has the state of each car that was seen on the bus."""
         for car, state in sorted(states.items()):
             available = is_available(state, now)
             if car not in self._said:

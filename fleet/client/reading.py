@@ -27,10 +27,10 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def age_of_answer_s(stamp_s: float, now: float) -> float:
-    """Return the age of an answer to a query, by its stamp. Both times: s since the epoch.
+    """Return the age of an answer to a query, by its stamp. Both times are in s since the epoch.
 
-    At least 0, as clocks differ. Infinite if the stamp is far ahead: then a wall clock was set back since the stamp,
-    and the value may be of any age.
+    A stamp that is slightly ahead gives 0, because clocks differ. A stamp that is far ahead gives infinity: a clock was
+    set back after the answer was stamped, so the value may be of any age.
     """
     return inf if stamp_s - now > MAX_STAMP_AHEAD_S else max(0.0, now - stamp_s)
 
@@ -66,8 +66,8 @@ class Reading:
     def __getitem__(self, field: str) -> Any:
         """Return the value of a field, such as `range_m` or `hold.by`. None if it was not measured or is not set.
 
-        For a list or a part of a message, such as `hold`, return whether it is there. Raises KeyError for another name;
-        the error lists the fields.
+        For a list, return True if it has elements. For a part of a message, such as `hold`, return True if it is set.
+        Raises KeyError if there is no such field; the error lists the fields.
         """
         known = fields_of(type(self.value))
         if field not in known:
@@ -187,7 +187,11 @@ class Watch:
             self._undeclare()
 
     def _on_sample(self, sample: Sample) -> None:
-        """Queue a sample. Runs on the subscription's Zenoh thread, the only one that puts."""
+        """Queue a sample.
+
+        Only the Zenoh thread of the subscription calls this. So nothing else fills the queue between the check and the
+        put.
+        """
         if self._queue.full():
             with contextlib.suppress(queue.Empty):  # the reader has just emptied the queue
                 self._queue.get_nowait()

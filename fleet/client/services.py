@@ -24,7 +24,7 @@ def send_command(bus: Bus, fleet: str, service: str, verb: str, command: Any, ti
 
 
 def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
-    """Send a command to the recorder. Return its fleet.v1.Recording or a Failure, None if there is no recorder."""
+    """Send a command to the recorder. Return its fleet.v1.Recording, or a Failure, or None without a recorder."""
     key, payload = keys.command_key(fleet, keys.RECORDER, verb, bus.identity), json.dumps(fields).encode()
     for answer in bus.query(key, payload=payload, encoding=messages.JSON, timeout_s=RECORDER_TIMEOUT_S):
         if isinstance(answer, Failure):
@@ -35,7 +35,10 @@ def ask_recorder(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
 
 
 def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
-    """Yield the site and the fleet.v1.Recording of each recorder that answers. Skip answers of other programs."""
+    """Ask the recorders of other sites, whose hubs are linked to ours. Yield each site with its fleet.v1.Recording.
+
+    Skip answers of other programs.
+    """
     for answer in bus.query(f"{keys.recorder_token(fleet, '*')}/status", timeout_s=RECORDER_TIMEOUT_S):
         if isinstance(answer, Failure) or not (site := keys.recorder_site(fleet, answer.key.removesuffix("/status"))):
             continue
@@ -44,22 +47,29 @@ def site_recordings(bus: Bus, fleet: str) -> Iterator[tuple[str, Any]]:
 
 
 def _recording_in(answer: Sample) -> Any:
-    """Return the fleet.v1.Recording in an answer. None for another answer: without certificates, anybody may answer."""
+    """Return the fleet.v1.Recording in an answer, or None if the answer has none.
+
+    On a bus without certificates, any program may answer.
+    """
     named = topics.TOPICS["@recorder/status"].message
     return next((each for each in messages_of([answer]) if each.DESCRIPTOR.full_name == named), None)
 
 
 def why_unrecorded(status: Any) -> str:
-    """Return why the recorder of this fleet.v1.Recording writes nothing now. Empty if it records, or was stopped."""
+    """Return why a recorder writes nothing now. Empty if it records, or was stopped.
+
+    status: its state, a fleet.v1.Recording.
+    """
     if status.state not in (RecorderState.FULL, RecorderState.FAILED):
         return ""
     return status.error or status.warning or f"the recorder is {status.state}"
 
 
 def ask_coordinator(client: Fleet, verb: str, plan_text: str = "", sender: str = "") -> Any:
-    """Send a request to the coordinator. Return the first answer that `send_command` yields, None if there is none.
+    """Send a request to the coordinator. Return the first answer that `send_command` yields, or None if there is none.
 
-    verb: `plan`, with the text of the plan to set, or a PlanRequest. sender: who asks, if it is not the client.
+    verb: `plan` to set the plan `plan_text`, or `restart`, `next` or `stop` for the plan in force. sender: the person
+    who asks, if that is not the client.
     """
     by = sender or client.sender
     if verb == "plan":

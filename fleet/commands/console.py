@@ -69,7 +69,7 @@ def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
 def listen_or_fail(port: int | None, other: str) -> socket.socket:
     """Return a socket that listens at this port, or at the default port if `port` is None. Raises ClickException.
 
-    other: the command that the error proposes, with `{other}` in place of a free port's number.
+    other: a command that the error proposes. Another port replaces `{other}` in it.
     """
     port = DEFAULT_PORT if port is None else port
     try:
@@ -80,7 +80,7 @@ def listen_or_fail(port: int | None, other: str) -> socket.socket:
 
 
 async def _send_heartbeats(parent: int, address: str) -> None:
-    """Print the address each second for `fleet up`, and end when `fleet up` ends."""
+    """Print the address each second for `fleet up`. When `fleet up` ends, end this process, too."""
     with suppress(OSError):  # nobody reads any more
         while not has_ended(parent):
             click.echo(json.dumps({"console": address}))
@@ -276,7 +276,7 @@ def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
 
 
 def _network() -> Any:
-    from fleet.console import network_console  # importing its packages takes 0.1 s, and only --lan needs them
+    from fleet.console import network_console  # importing it takes 0.1 s; only --lan and `pair` need it
 
     return network_console
 

@@ -1,4 +1,4 @@
-"""`fleet sessions redecode` and `fleet sessions vector`: decode recorded frames again, and cut test vectors."""
+"""`fleet sessions redecode` decodes recorded frames again. `fleet sessions vector` makes a test vector of them."""
 
 import json
 from collections.abc import Iterable, Iterator

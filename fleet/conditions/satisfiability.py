@@ -1,7 +1,8 @@
-"""Finds conditions that can never be true. Pure. It may miss some, but each that it finds is never true.
+"""Finds conditions that can never be true. Pure. It does not find all of them, but what it finds is never true.
 
 A condition is split into alternatives. Each is a set of comparisons that together make the condition true. An
-alternative is impossible if its comparisons of one field exclude each other, or if its comparisons of two fields do.
+alternative is impossible if no value of a field fulfils all its comparisons of this field (`a < 1 and a > 2`), or if no
+two values fulfil all its comparisons of two fields with each other (`a < b and a > b`).
 """
 
 from collections.abc import Iterable
@@ -24,7 +25,7 @@ _DOMAINS: Final = {
 """Allowed words and range by name. A name is the last word of the topic and the field, such as `range.range_m`."""
 _Alternative: TypeAlias = tuple[Compare, ...]
 _RELATIONS: Final = {Op.LT: "<", Op.LE: "<=", Op.GT: ">", Op.GE: ">=", Op.EQ: "=", Op.NE: "<>"}
-"""The relations of two values that fulfil each operator, one character for each."""
+"""The relations of two values that fulfil an operator. One character is one relation: `<=` means smaller or equal."""
 _OPPOSITE: Final = {Op.LT: Op.GE, Op.GE: Op.LT, Op.GT: Op.LE, Op.LE: Op.GT, Op.EQ: Op.NE, Op.NE: Op.EQ}
 _MIRRORED: Final = {Op.LT: Op.GT, Op.GT: Op.LT, Op.LE: Op.GE, Op.GE: Op.LE, Op.EQ: Op.EQ, Op.NE: Op.NE}
 

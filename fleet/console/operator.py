@@ -1,4 +1,4 @@
-"""Sends the commands of the pages of one person: the stream of drives of a held press, STOP, and single commands."""
+"""Sends the commands of one person's pages: drives while a button is held (a press), STOP, and single commands."""
 
 import asyncio
 import logging
@@ -75,7 +75,7 @@ class ConsoleOperator:
     def end_press(self, press: HeldPress, cars: Iterable[str] | None = None) -> None:
         """Stop the cars of a press, or some of them.
 
-        Stop them at once in the stream of drives, then by a query, which has an outcome.
+        Send the stop twice: at once in the stream of the drives, and then as a query, which has an outcome.
         """
         stopped = tuple(press.cars if cars is None else cars)
         _, count, _ = self._streams.pop((press.client, press.id), (0.0, 0, ()))
@@ -124,8 +124,8 @@ class ConsoleOperator:
     async def _report_stop(
         self, request: CommandRequest, command: PendingCommand, report: StopReport, is_shown: Callable[[str], bool]
     ) -> None:
-        # A person who stops again gets the outcome of the newest stop, which concerns the same cars. Each wait blocks a
-        # thread until the slowest car stands: ten stops a second would need 60 threads.
+        # To wait for a stop blocks a thread until the slowest car stands. Ten stops a second would need 60 threads. So
+        # wait only for a person's newest stop, which concerns the same cars as the earlier ones.
         who = (report.sender, request.verb)
         if (earlier := self._stops.get(who)) is not None:
             earlier.abandon()
@@ -200,7 +200,8 @@ class ConsoleOperator:
     async def ask_coordinator(self, verb: str, text: str = "", sender: str = "") -> tuple[bool, str] | None:
         """Send a request to the coordinator.
 
-        Return whether it was carried out, and words, or None if no plan is running. text: the text of a plan to set.
+        Return True if it was carried out, and the words of the answer. Return None if no plan is running.
+        text: the text of a plan to set.
         """
         answer = await self._fleet.call(ask_coordinator, self._fleet.sync, verb, text, sender)
         if answer is None:
@@ -208,7 +209,7 @@ class ConsoleOperator:
         return not isinstance(answer, Failure) and answer.status == Phase.SENT, answer.words
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> "asyncio.Task[None]":
-        """Run a coroutine. Its errors are logged, and never reach the socket that began it."""
+        """Run a coroutine as a task. Its errors are logged, and do not end the connection of a page."""
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._on_done)

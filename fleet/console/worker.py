@@ -20,7 +20,7 @@ NICENESS: Final = 10
 """The console, the gateways and the recorder go first."""
 _MAX_ANSWER_BYTES: Final = 64 * 1024 * 1024
 """Maximum size of an answer. A plan of 64 KiB may have a fault in each line, with a text of 200 bytes each: 16 MB. The
-lanes of fifty cars, each with the maximum number of spans, take some 60 MB."""
+lanes of fifty cars on a time line, each lane with the maximum number of spans, take some 60 MB."""
 
 
 class TooManyQuestions(Exception):
@@ -81,8 +81,8 @@ class Worker:
 
     async def _answer(self, line: bytes) -> dict[str, Any] | None:
         """Return the answer of the process, or None if the process has died."""
-        # Keep the process only after its answer was read. An answer that nobody read would be taken for that to the
-        # next question.
+        # Keep the process only if its answer was read. Otherwise the next question would get the answer that nobody has
+        # read.
         process, self._process = self._process or await self._start(), None
         answered = False
         try:

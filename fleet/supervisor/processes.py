@@ -23,10 +23,10 @@ from schemas.words import ProcessKind, RunState
 SUPERVISOR_POLL_INTERVAL_S: Final = 0.1
 """Interval at which the supervisor polls its processes."""
 STARTS_AT_ONCE: Final = 1 + (os.cpu_count() or 1)
-"""Maximum number of gateways that start at the same time. A start takes 0.3 s of CPU time, but a gateway also waits in
-between."""
+"""Maximum number of gateways that start at the same time. A start takes 0.3 s of CPU time and also some waiting, so
+one start more than there are CPUs keeps them busy."""
 MISSED_HEARTBEAT_S: Final = 2.0
-"""Silence after which a process counts as silent: it has missed one heartbeat."""
+"""Time without a heartbeat after which a process counts as silent. It has then missed at least one heartbeat."""
 CPU_CHECK_SILENCE_S: Final = 1.0
 """Silence after which a process's CPU time is sampled."""
 
@@ -101,8 +101,8 @@ class ProcessSet:
     def add(self, name: str, kind: ProcessKind, command: tuple[str, ...], *, restart: bool = False) -> None:
         """Add a process.
 
-        A process of this name is restarted if its command differs, if it is ending for good or was refused, or if
-        `restart` is True.
+        A process of this name is restarted if its command differs, if it is ending for good, if it ended because its
+        arguments were wrong (REFUSED), or if `restart` is True.
         """
         process = self._processes.get(name)
         if process is None:
@@ -141,8 +141,8 @@ class ProcessSet:
     ) -> None:
         """Start the due processes and kill the hung ones.
 
-        `since` returns the time since which a process's heartbeats could be received without a break, or None if they
-        cannot be received now. `may_move` returns True if a gateway's car may be moving.
+        `since` returns when the connection began on which a process's heartbeats are received, or None if there is no
+        such connection now. `may_move` returns True if a gateway's car may be moving.
         """
         now = self.now
         silent = {process.name: process.status.silent_s(now, since(process)) for process in self}

@@ -24,7 +24,7 @@ BLE_START_TIMEOUT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class BleDevice(Device):
-    """An advertising Bluetooth LE device. `uart` is its UART service, as modules of cars have one."""
+    """An advertising Bluetooth LE device. `uart` is its service for serial bytes (UART), which modules of cars have."""
 
     address: str
     url: str
@@ -44,7 +44,7 @@ class BleDevice(Device):
 
     @property
     def likely(self) -> str:
-        """A text with the UART service of the device. Empty if it has none."""
+        """Why the device is probably a car's: its UART service. Empty if it has none."""
         return "" if self.uart is None else f"it has the Bluetooth service {self.uart}"
 
 
@@ -57,14 +57,14 @@ async def _discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementD
 
 
 async def list_devices(seconds: float, uarts: Sequence[str]) -> list[BleDevice]:
-    """Return the devices that advertise within this time, first those with one of these services. Raises CannotList."""
+    """Return the devices that advertise within this time, first those with a service in `uarts`. Raises CannotList."""
     try:
         async with asyncio.timeout(seconds + BLE_START_TIMEOUT_S):
             found = await _discover(seconds)
     except TimeoutError:
         raise CannotList("Bluetooth was not searched: its service does not answer. Is it running?") from None
     except Exception as error:  # noqa: BLE001 - whatever a system's Bluetooth stack raises, `scan` still lists the ports
-        if isinstance(error, FileNotFoundError | ConnectionRefusedError):  # the socket of D-Bus
+        if isinstance(error, FileNotFoundError | ConnectionRefusedError):  # D-Bus is missing
             raise CannotList("Bluetooth was not searched: no D-Bus or BlueZ is running here.") from None
         words = " ".join(str(error).split()) or type(error).__name__
         raise CannotList(f"Bluetooth was not searched: {words}. Is there an adapter, and is it on?") from None

@@ -16,7 +16,7 @@ _REMEMBERED: Final = 4096
 
 @lru_cache(_REMEMBERED)
 def _contradictory(both: Expression) -> bool:
-    # Conditions are joined as trees. Joined as text, two could be longer or deeper than a condition may be.
+    # `both` was joined from the trees of two conditions. Their joined texts could be longer or deeper than is allowed.
     return is_contradictory(both)
 
 
@@ -41,7 +41,7 @@ def _can_coincide(one: PlanCondition, other: PlanCondition) -> bool:
 
 
 def find_conflicts(plan: Plan) -> Iterator[tuple[Rule, str, bool]]:
-    """Yield each rule that contradicts an earlier rule or itself, with a text, and True if it always does so."""
+    """Yield each rule that conflicts with an earlier rule or itself, a text about it, and True if it always does."""
     for index, rule in enumerate(plan.rules):
         possible: list[str] = []
         for effect in rule.effects:
@@ -88,7 +88,7 @@ def _asked_condition(mode: Mode) -> Expression:
 
 
 def _contradiction(effect: Effect, other: Effect) -> str:
-    """Return the role, mode or color of the other effect that contradicts this one. Empty if they do not conflict."""
+    """Return what the other effect sets (a role, mode or color) if it contradicts this one. Otherwise return ""."""
     wish, others = effect.mode or effect.role, other.mode or other.role
     if wish is not None and others is not None and (effect.mode, effect.role) != (other.mode, other.role):
         return str(others)
@@ -111,7 +111,7 @@ def _can_meet(plan: Plan, rule: Rule, effect: Effect, earlier: Rule, other: Effe
 
 
 def _target(rule: Rule, effect: Effect) -> str:
-    """Return the target of an effect: the car's name if it can be only one car."""
+    """Return the target of an effect. For THIS_CAR, return the name of the car if the condition is about one car."""
     return rule.when.car if effect.who == THIS_CAR and rule.when.car is not None else effect.who
 
 

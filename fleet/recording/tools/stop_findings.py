@@ -1,8 +1,9 @@
-"""Finds the failed stops of a session: those that a car did not show, and those that did not reach a car. Pure.
+"""Finds the failed stops of a session. Pure.
 
-A gateway records such a stop twice: as the last event of each command that asked for it, and in its log. Both have the
-same words, so they become one finding here. The likely cause is in the last states before the stop: a lost link, a car
-that did not show an earlier stop, or a car whose reports cannot show a stop.
+A stop has failed if it did not reach the car, or if the car did not show it: its readings are no evidence that the stop
+arrived. A gateway records such a stop twice: as the last event of each command that asked for it, and in its log. Both
+have the same words, so they become one finding here. The likely cause is in the last states before the stop: a lost
+link, a car that did not show an earlier stop, or a car whose reports cannot show a stop.
 """
 
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ _OPEN: Final = frozenset({LinkState.ONLINE, LinkState.QUIET})
 
 
 class UnshownStop(Struct):
-    """One stop that was not shown (`not_shown`), or did not reach the car or was given up (`not_stopped`)."""
+    """One failed stop. Its code is `not_shown`, or `not_stopped` if the stop did not reach the car or was given up."""
 
     car: str
     at_ns: int
@@ -60,7 +61,7 @@ class UnshownStop(Struct):
 
 
 class StopFindings(Struct):
-    """The stops of one session that were not shown, in the order of their times."""
+    """The failed stops of one session, in the order of their times."""
 
     stops: list[UnshownStop] = field(default_factory=list)
     _states: dict[str, dict[str, Any]] = field(default_factory=dict)

@@ -1,8 +1,8 @@
 """The driver of the cars that speak the `$...#` protocol (docs/reference/protocol.md). Pure.
 
-`CarModel` has the estimates of the car. `CarMonitor` updates it with readings and silence, `Executor` with each written
-frame. `StopExecutor` carries out the stops. This module joins them to one driver, which also decodes bytes and encodes
-actions.
+`CarModel` estimates the state of the car. `CarMonitor` updates these estimates when a reading arrives or the car is
+silent, `Executor` when a frame is written. `StopExecutor` carries out the stops. This module joins them to one driver,
+which also decodes bytes and encodes actions.
 """
 
 from collections.abc import Callable, Mapping
@@ -38,8 +38,8 @@ from schemas.commands import Verb
 from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
 
 STALE_TIMES_S: Final = 0.5
-"""Maximum time for which our loop may stand still. After a longer one, the times of reports do not count: a report that
-is only read late may look like one that shows a stop."""
+"""Maximum stall of our loop after which the times of reports still count. A stop delays the reports of a car, and this
+shows that it arrived. After a longer stall, a report that we have read late looks like such a delay."""
 
 
 class YahboomDriver(Executor):
@@ -53,7 +53,7 @@ class YahboomDriver(Executor):
 
     @property
     def lost_frames(self) -> int:
-        """Return the number of `MODE00` frames that did not arrive, as the car's reports show."""
+        """Return the number of `MODE00` frames (back to mode 0) that did not reach the car, as its reports show."""
         return self._monitor.lost_frames
 
     # ------------------------------------------------------------------ bytes in
@@ -84,7 +84,7 @@ class YahboomDriver(Executor):
         return measured(_as_wire_event(event), self.model.profile, self.model.mode.confirmed)
 
     def verdict(self, event: Event) -> str:
-        """Return the kind of an event's bytes."""
+        """Return the kind of an event, such as `sensors` or `echo`, or the cause for which its bytes were rejected."""
         return verdict_of(_as_wire_event(event))
 
     def on_event(self, event: Event, now: float) -> None:
@@ -111,7 +111,10 @@ class YahboomDriver(Executor):
         self._monitor.tick(now)
 
     def on_stall(self, gap_s: float, now: float) -> None:
-        """Stop a driven car after a gap of the loop. Ignore the times of its reports during the gap."""
+        """Stop a driven car after a gap of the loop, which has not run for `gap_s`.
+
+        If the gap was long, ignore the times of the reports before and in it.
+        """
         if gap_s > STALE_TIMES_S:
             self.model.evidence.reset_times()
         super().on_stall(gap_s, now)
@@ -123,7 +126,7 @@ class YahboomDriver(Executor):
         super().on_sleep(slept_s, now)
 
     def stop_after_sleep(self, now: float) -> None:
-        """Stop the car. Continue a stop that began before the sleep, with its next try at once."""
+        """Stop the car, or make the next try of a stop that began before the sleep."""
         self.stops.on_sleep(now)
 
     # ------------------------------------------------------------------ commands
@@ -172,7 +175,10 @@ class YahboomDriver(Executor):
         return tuple(each for each in self._frames_of(what) if self.model.profile.refusal(frame_of(each)) is None)
 
     def _frames_of(self, what: Action) -> tuple[Frame | Later, ...]:
-        """Return the frames of an action. A general frame gets the present motion when it is written."""
+        """Return the frames of an action.
+
+        Each `General` frame has a motion. It is STOP here, and becomes the present motion when the frame is written.
+        """
         match what:
             case Led(r, g, b):
                 return (ColorLed(r, g, b),)
@@ -206,11 +212,11 @@ class YahboomDriver(Executor):
         return whistle, other, whistle, led
 
     def opening_s(self, mode: Mode) -> float:
-        """Return how long the car takes to open a mode, s."""
+        """Return the maximum time, in s, for which the car is busy when it begins a mode."""
         return self.model.profile.block_s(ModeOpen(mode))
 
     def end_doubt(self, now: float) -> None:
-        """End the doubt about a car that has shown its stops before."""
+        """End the doubt about a car that did not show its last stop, because a person says that it is fine."""
         self.stops.end_doubt(now)
 
     # ------------------------------------------------------------------ what outlives the gateway
@@ -221,7 +227,7 @@ class YahboomDriver(Executor):
 
     @property
     def opened_as(self) -> str:
-        """Return the platform of the car if a mode may be open in it, else an empty text."""
+        """Return the platform of the car if a mode that the gateway began may still run, else an empty text."""
         return self.model.learned.opened_as
 
 

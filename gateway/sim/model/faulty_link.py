@@ -181,7 +181,7 @@ class FaultyLink:
         out = self._lanes[Direction.TO_HOST].take(now)
         if self._flood_at < self._flood_until:
             end = min(now, self._flood_until)
-            # If the last call was longer ago, only the bytes of the last second are sent, because no buffer holds more.
+            # No buffer holds more than one second of bytes. So after a longer pause, send those of the last second.
             since = max(self._flood_at, end - 1.0)
             count = int((end - since) * self._flood_rate + 1e-6)
             self._flood_at = end if end == self._flood_until else since + count / self._flood_rate
@@ -196,7 +196,7 @@ class FaultyLink:
         return NEVER_ENDING[begun : begun + count].ljust(count, b"0")
 
     def waiting(self) -> int:
-        """Return the number of bytes queued to the car; feed no more while it is large."""
+        """Return the number of bytes queued to the car. The caller feeds no more bytes while this number is large."""
         return self._lanes[Direction.TO_CAR].waiting
 
     @property
@@ -212,6 +212,6 @@ class FaultyLink:
         return due
 
     def clear(self) -> None:
-        """Cut the link: lose all queued bytes."""
+        """Lose all queued bytes, because the link breaks."""
         for lane in self._lanes.values():
             lane.clear()

@@ -1,8 +1,9 @@
-"""The ONE flat world that all cars of a simulator share: walls, a taped line, lamps, things, and the cars as bodies.
+"""The ONE flat world that all cars of a simulator share: walls, a taped line, lamps, things and the bodies of the cars.
 
-`car_body` has the sensors. In a plain world (no things, cars do not meet), each car is moved on only when its state is
-needed. In a lively world, all cars are moved together, in ticks of STEP_S. Units and axes are those of REP-103: meters,
-x forward, y left, angles counter-clockwise.
+A thing is a disc or a box that stands, moves or is carried. `car_body` has the sensors. A world is lively if it has
+things or a carried lamp, or if cars meet. In a lively world, all cars are moved together, in ticks of STEP_S. In a
+plain world, a car is moved only when its state is needed. Units and axes are those of REP-103: meters, x forward,
+y left, angles counter-clockwise.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -34,7 +35,7 @@ STEP_S: Final = 0.04
 TAPE_M: Final = 0.025
 _BUCKET_M: Final = 0.25
 _PUSH_ROUNDS: Final = 3
-"""Maximum number of rounds in which a car is pushed out of each obstacle in turn."""
+"""Maximum number of rounds. In each round, a car is pushed out of one obstacle after the other."""
 _TOLERANCE_M: Final = 1e-9
 _START_GRID_M: Final = 0.4
 """Distance between the start places that the world chooses for cars without one in the world file."""
@@ -58,7 +59,7 @@ class WorldBody(Protocol):
         """True if a motor is on."""
 
     def glide(self, now: float) -> None:
-        """Move on to `now`, at most one tick."""
+        """Move the car as far as it drives until `now`, which is at most one tick after its last move."""
 
 
 class World:
@@ -103,7 +104,7 @@ class World:
 
     @classmethod
     def room(cls) -> "World":
-        """Return a room of 5.0 x 3.6 m with a box and a line loop, so small that every ranging has an echo."""
+        """Return a room of 5.0 x 3.6 m with a box and a line loop. In such a small room every ranging has an echo."""
         walls = (*box(0.0, 0.0, 5.0, 3.6), *box(0.0, 0.0, 0.5, 0.5))
         return cls(walls, loop(1.7, 1.05, 0.6))
 
@@ -113,7 +114,7 @@ class World:
         return cls()
 
     def start_pose(self, index: int, name: str = "") -> Pose:
-        """Return the start pose of a car: its own from the world file, or number `index` along the line.
+        """Return the start pose of a car: its own from the world file, or a place on the line that depends on `index`.
 
         In a lively world, a car without a place of its own starts where there is room.
         """
@@ -136,7 +137,10 @@ class World:
         return sorted(spots, key=lambda pose: hypot(pose.x_m, pose.y_m))
 
     def _free(self, pose: Pose) -> bool:
-        """Return True if a car can start there: the place is empty, and in sight of the start of a car in the file."""
+        """Return True if a car can start there. The place must be empty.
+
+        If the world file has start places, a car at one of them must see this place.
+        """
         x, y, _ = pose
         cars = (*self._starts.values(), *(body.place for body in self.bodies)) if self.cars_meet else ()
         return (
@@ -212,7 +216,7 @@ class World:
             self.bodies.append(body)
 
     def settle(self, now: float) -> None:
-        """Move all cars on to the last tick before `now`, tick by tick together."""
+        """Move all cars together, one tick after the other, up to the last tick that is not after `now`."""
         last = floor((now - self._began) / STEP_S)
         if last <= self._tick:
             return
@@ -313,7 +317,7 @@ class World:
     # Sight.
 
     def met(self, me: WorldBody | None, x: float, y: float, angle: float, reach_m: float, now: float) -> Hit | None:
-        """Return the first hit of a ray on a thing or car within `reach_m`. All cars must be at `now`."""
+        """Return the first hit of a ray on a thing or car within `reach_m`. All cars must have moved up to `now`."""
         dx, dy = cos(angle), sin(angle)
         hits: list[Hit | None] = []
         for other in self.others(me):
@@ -327,7 +331,7 @@ class World:
         return hit if hit is not None and hit[0] <= reach_m else None
 
     def clear(self, a: Point, b: Point, without: Iterable[str] = (), *, now: float = 0.0) -> bool:
-        """Return True if nothing stands between two points, in either direction.
+        """Return True if nothing stands between two points. The result does not depend on their order.
 
         `without` has the names of cars and things to ignore.
         """
