@@ -31,7 +31,7 @@ class CapturedBytes(Struct, frozen=True):
 class CaptureWriter:
     """Appends pieces to a new file and flushes each one, so that a killed monitor loses nothing.
 
-    Raises OSError; FileExistsError if the file exists, as a capture is never overwritten.
+    Raises OSError. If the file exists, this is a FileExistsError, because a capture is never overwritten.
     """
 
     def __init__(self, path: Path, link: str, started: str) -> None:

@@ -78,7 +78,7 @@ def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
 
 
 def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]:
-    """Return how far the clock of each car's gateway is off, s. Cars whose clock is right are left out.
+    """Return by how many seconds the clock of each car's gateway is wrong. Leave out cars whose clock is right.
 
     newest_s: by car, the newest stamp in its answers. If a stamp is off by more than MAX_CLOCK_OFF_S, listen to the
     states of that car for at most _CLOCK_LISTEN_S.

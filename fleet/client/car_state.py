@@ -243,7 +243,7 @@ class CarState(Struct):
         return bool(self.safety.motors == Motors.UNKNOWN and self.last_rx_s > _UNHEARD_S)
 
     def why_not_ready(self, now: float) -> str | None:
-        """Return why the car is not ready, in words. Empty if the cause is not known, None if the car is ready.
+        """Return why the car is not ready, in words. Empty if the cause is not known. None if the car is ready.
 
         A ready car answers, and a command to it does not have to wait.
         """

@@ -15,7 +15,7 @@ from typing import Final
 MAX_CLOCK_OFF_S: Final = 5.0
 """A larger difference of two clocks is reported. A gateway refuses a command that comes from further in the future."""
 _KEPT: Final = 8
-"""Number of messages that are remembered: those of two seconds, as each of four states comes once a second."""
+"""Number of messages that are remembered: those of two seconds, because four states come once a second each."""
 _MIN_STAMPS: Final = 2
 _NS: Final = 1e9
 
@@ -37,7 +37,7 @@ class GatewayClock:
 
     @property
     def off_s(self) -> float | None:
-        """How far the gateway's clock is ahead of ours, s. Negative if it is behind, None if not known yet."""
+        """How many seconds the gateway's clock is ahead of ours. Negative if it is behind. None if not known yet."""
         if len({stamp for stamp, _ in self._leads}) < _MIN_STAMPS:
             return None
         return max(lead for _, lead in self._leads)

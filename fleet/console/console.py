@@ -212,7 +212,7 @@ class Console:
         self._plots.on_sample(sample)
 
     def _newest_samples(self) -> Iterator[tuple[float, Sample]]:
-        """Yield the newest samples of the cars from the bus, each with its age, s."""
+        """Yield the newest samples of the cars from the bus, each after its age in s."""
         name = self._fleet.sync.name
         for car, topic, age_s, message in self._view.newest(time.monotonic()):
             encoding = TOPICS[topic].encoding

@@ -34,7 +34,7 @@ class PlotFeed(PageFeed):
         self._spawn = spawn
         self._buffers: dict[int, PlotBuffer] = {}
         self._wanted: dict[int, tuple[PlotBuffer, float]] = {}
-        """The newest plot of each page that still waits for its history, and how far back it goes, s."""
+        """The newest plot of each page that still waits for its history, and how many seconds that history covers."""
         self._reading: set[int] = set()
         """The pages whose history is being read."""
         self._questions = asyncio.Semaphore(MAX_HISTORY_QUESTIONS)

@@ -36,7 +36,7 @@ class StopReport:
         self._asked_at = now
         self._at_ms = at_ms
         self._result_ns: dict[str, int] = {}
-        """For each car, the stamp of the event or state from which its result follows, by its gateway's clock, ns."""
+        """For each car, the stamp of the event or state from which its result follows: ns of its gateway's clock."""
         self._cars: dict[str, dict[str, Any]] = {name: _entry(Phase.ASKED) for name in cars}
         self._closed: set[str] = set()
         """The cars whose rows are closed, because they moved after the STOP."""

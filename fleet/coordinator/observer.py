@@ -112,7 +112,10 @@ class FleetObserver(Struct):
             self.cars[car] = replace(self.cars[car], refused=refusal)
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
-        """Add a message. `wall_s` is the wall clock if a query returned it, as it may be old. Otherwise it is None."""
+        """Add a message.
+
+        If the message is the answer to a query, it may be old. Then `wall_s` is our wall clock, otherwise None.
+        """
         key = keys.parse(sample.key)
         topic = None if key is None else topics.TOPICS.get(key.topic)
         if key is None or topic is None:

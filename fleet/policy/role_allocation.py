@@ -75,7 +75,7 @@ class Candidates(Struct, frozen=True):
         return self.snapshot.describe_readings(barrier.looks_at, car, self.now)
 
     def barrier(self, car: str, role: Role) -> Barrier | None:
-        """Return why this car may not have this role, None if it may."""
+        """Return why this car may not have this role, or None if it may."""
         name = role.name
         pinned = self.pinned.get(car)
         if pinned is not None and pinned.role != name:

@@ -211,7 +211,7 @@ class Catalog:
         """
         found: dict[str, list[str]] = {}
         for cast in self._casts:
-            with suppress(self._duckdb.Error):  # deleted since the question
+            with suppress(self._duckdb.Error):  # its files were deleted after the question
                 for session, count in self._database.execute(cast.count()).fetchall():
                     words = f"{count} of {cast.topic} {cast.column}: not {cast.kind}"
                     found.setdefault(session, []).append(printable_lines(words))

@@ -62,7 +62,7 @@ def _days_before(day: str, now_s: float) -> int | None:
 
 
 def _date_ns(text: str) -> tuple[int, int]:
-    """Return begin and end of a date with a time, ns. Raises _Unreadable."""
+    """Return the begin and the end, in ns since the epoch, of a date with a time. Raises _Unreadable."""
     try:
         when = datetime.fromisoformat(text)
         whole = int(when.replace(microsecond=0).timestamp())
@@ -75,7 +75,7 @@ def _date_ns(text: str) -> tuple[int, int]:
 
 
 def ago_s(text: str, now_s: float) -> float:
-    """Return how long ago a time was, s. The text, the errors and `now_s` are as for `past_ns`."""
+    """Return how many seconds ago a time was. The text, the errors and `now_s` are as for `past_ns`."""
     duration = duration_s(text.removeprefix("-"))
     return now_s - past_ns(text, now_s) / _NS if duration is None else duration
 

@@ -133,7 +133,7 @@ class SupervisorService:
         return self.plan_in_force() is not None
 
     def plan_in_force(self) -> Any:
-        """Return the coordinator's fleet.v1.Plan, None if it does not answer. Call it on a thread."""
+        """Return the coordinator's fleet.v1.Plan, or None if it does not answer. Call this on a thread."""
         answers = self.bus.query(
             f"{self.fleet}/{keys.COORDINATOR}/plan", timeout_s=SERVICE_QUERY_TIMEOUT_S, qos=Qos.STATE
         )
@@ -208,7 +208,7 @@ def _proven_sender(identity: str, sender: str, verb: str, refusal: Callable[[str
 
 
 def ask_service(bus: Bus, fleet: str, verb: str, sender: str, timeout_s: float = 30.0) -> Any:
-    """Send a command to the supervisor. Return its fleet.v1.Result, None if no supervisor answers."""
+    """Send a command to the supervisor. Return its fleet.v1.Result, or None if no supervisor answers."""
     command = messages.message_class(SUPERVISOR_COMMANDS[verb])()
     # Both messages have these fields.
     command.sender, command.kind, command.id = sender, Rank.PERSON, uuid.uuid4().hex  # type: ignore[attr-defined]

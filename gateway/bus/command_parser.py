@@ -190,7 +190,7 @@ def _encoding(request: Request) -> str:
 
 
 def _age_s(message: Any, request: Request, now_ns: int) -> float | None:
-    """Return the age of a request, s. None if it is unknown, negative if the sender's clock is ahead of ours."""
+    """Return the age of a request in s. None if it is unknown, negative if the sender's clock is ahead of ours."""
     if message.HasField("asked"):
         age_ns: int = now_ns - messages.stamp_ns(message.asked)
         return age_ns / 1e9

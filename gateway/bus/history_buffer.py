@@ -52,7 +52,7 @@ class Bound(Struct, frozen=True):
     from_now: bool = False
 
     def before(self, value: Value, now: float) -> int:
-        """Return how long the bound is before a value, ns.
+        """Return by how many ns the bound is before a value.
 
         A date is compared with the stamp, because readers see the stamp. An age is counted by the monotonic clock, so
         that it is right even if the wall clock was set meanwhile.

@@ -37,7 +37,7 @@ def _rss_mb() -> float:
         pass
     try:
         import resource
-    except ImportError:  # Windows
+    except ImportError:  # Windows has no such module
         return 0.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3

@@ -36,7 +36,7 @@ class BatteryPolicy(Struct, frozen=True):
     critical_v: float = CRITICAL_V
 
     def level(self, voltage_v: float) -> BatteryLevel:
-        """Return the level of a voltage at rest, V."""
+        """Return the level of a voltage (in V) without a load."""
         if voltage_v < self.critical_v:
             return BatteryLevel.CRITICAL
         return BatteryLevel.LOW if voltage_v < self.low_v else BatteryLevel.OK

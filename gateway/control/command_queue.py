@@ -30,7 +30,7 @@ class HeldMotion(Struct):
     began_at: float | None = None
     """When the frame of the drive was written, or None if the drive still waits."""
     range_cm: float | None = None
-    """The last measured distance before that frame was written, cm. None if it is not known."""
+    """The last distance (in cm) that was measured before that frame was written. None if it is not known."""
 
     @property
     def sender(self) -> Sender:

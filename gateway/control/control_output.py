@@ -42,7 +42,7 @@ class Later(Struct, frozen=True):
 
     frame: Any
     after_s: float
-    """Delay after the frame before it, or after the command if it is the first, s."""
+    """Delay in s after the previous frame, or after the command if this frame is the first one."""
 
 
 def frame_of(given: Any) -> Any:

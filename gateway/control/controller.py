@@ -449,7 +449,7 @@ class Controller(Generic[D_co]):
         return self._done(pending, f"{self.car} is free", now)
 
     def _busy_s(self, now: float) -> float:
-        """Return how long a motion would have to wait for the car, as far as that is known, s."""
+        """Return how many seconds a motion would have to wait for the car, as far as that is known."""
         return max(self.driver.free_at(now) - now, 0.0)
 
     def _too_busy(self, command: Command, now: float) -> str:

@@ -311,7 +311,10 @@ class Driver(ABC):
 
     @abstractmethod
     def drop_bytes(self) -> list[Event]:
-        """Forget the unfinished frame, as the link is lost or bytes were discarded. Return the events in its bytes."""
+        """Forget the unfinished frame, because the link is lost or bytes were discarded.
+
+        Return the events in the bytes of the frame.
+        """
 
     def sends(self, data: bytes, now: float) -> None:
         """Remember the bytes of a frame that is about to be written, if the link or the car may echo them."""
@@ -412,12 +415,12 @@ class Driver(ABC):
         return ""
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return how long a mode waits at most before its frame is written, s. `busy_s` is the same for a motion."""
+        """Return the longest wait, in s, of a mode until its frame is written. `busy_s` is the same for a motion."""
         del now
         return busy_s
 
     def opening_s(self, mode: Mode) -> float:
-        """Return how long the car takes to open a mode, s."""
+        """Return the maximum time, in s, for which the car is busy when it begins a mode."""
         del mode
         return 0.0
 

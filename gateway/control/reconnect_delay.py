@@ -16,7 +16,7 @@ _OPENED: Final = ""
 
 
 def delay_s(failures: int, jitter: float) -> float:
-    """Return the delay after `failures` (1..) in a row, s: half of the backoff with `jitter` 0, all of it with 1."""
+    """Return the delay in s after `failures` (1..) in a row: half of the backoff with `jitter` 0, all of it with 1."""
     return backoff_s(failures, FIRST_DELAY_S, MAX_RECONNECT_DELAY_S) * (0.5 + 0.5 * jitter)
 
 
@@ -61,5 +61,5 @@ class Attempts:
         return should_log
 
     def delay_s(self, jitter: float) -> float:
-        """Return the delay before the next attempt, s. For `jitter`, see the function `delay_s`."""
+        """Return the delay in s before the next attempt. For `jitter`, see the function `delay_s`."""
         return delay_s(max(1, self._failures), jitter)

@@ -107,7 +107,7 @@ async def list_connections() -> dict[str, int]:
 
 
 async def disconnect(adapter: str, address: str) -> None:
-    """End the connection of an adapter to a device. Ignore errors, as they mean that there is no connection."""
+    """End the connection of an adapter to a device. Ignore errors, because they mean that there is no connection."""
     if sys.platform != "linux":
         return
     path = f"/org/bluez/{adapter}/dev_{address.upper().replace(':', '_')}"

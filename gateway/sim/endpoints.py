@@ -284,7 +284,7 @@ class TcpEndpoint(SimEndpoint):
                 raise self._cannot_listen(0, error) from None
 
     def admit(self, transport: asyncio.Transport) -> bool:
-        """Accept a host; return False for a second one."""
+        """Accept a host. Return False if another host is connected already."""
         if self._transport is not None:
             return False
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -46,7 +46,7 @@ class Machine(Protocol):
         """Accept bytes from the host."""
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
-        """Run up to `now`; return the pieces sent since the last call."""
+        """Run the car up to `now`. Return the pieces that it has sent since the last call."""
 
     def next_event(self) -> float:
         """Return the time of the next event."""
@@ -369,7 +369,7 @@ class Simulation:
             await car.stop()
 
     async def inflict(self, fault: Fault) -> list[str]:
-        """Carry out a fault on one car or all; return their names. Raise BadSpec for an unknown car."""
+        """Carry out a fault on one car or all. Return the names of these cars. Raise BadSpec for an unknown car."""
         names = targets([car.spec for car in self.cars.values()], fault)
         for name in names:
             await self.cars[name].inflict(fault)

@@ -60,7 +60,7 @@ class CertificateKeeper(threading.Thread):
             wait_s = self.check()
 
     def check(self) -> float:
-        """Renew the certificate if it is due, or use a new one. Return the time until the next check, s."""
+        """Renew the certificate if it is due, or use a new one. Return the time in s until the next check."""
         now = self._clock()
         found = self._credentials.dates(self._identity)
         if found is None or self._used is None:

@@ -56,7 +56,7 @@ class SampleChannel(Declared):
         self._declaration = declaration
         self._older_is_over = False
         self.try_recv: Callable[[], zenoh.Sample | None] = lambda: None
-        """Return the next sample, or None if there is none. It is Zenoh's own method, as a wrapper would cost time."""
+        """Return the next sample, or None if there is none. It is Zenoh's own method, because a wrapper costs time."""
 
     def add(self, session: zenoh.Session, number: int) -> None:
         """Subscribe in a session. Read two declarations until the older one has ended and is empty."""

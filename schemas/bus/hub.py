@@ -135,7 +135,7 @@ def main() -> int:
 
 
 def _begin_again(watch: PanicWatch) -> None:
-    """Replace this process with a new hub after a panic in Zenoh, as the router then ignores some of its links.
+    """Replace this process with a new hub after a panic in Zenoh, because the router then ignores some links.
 
     A panic was seen when the hub of one site was restarted several times within seconds (Zenoh 1.10.2). Clients
     reconnect within a second, as after a change of the rules.

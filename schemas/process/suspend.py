@@ -37,7 +37,7 @@ _CLOCKS: Final = {
 }
 
 ClockPair = tuple[Callable[[], float], Callable[[], float]]
-"""Two clocks, s: one that continues during a sleep of the computer, and one that stands still."""
+"""Two clocks that count seconds: one continues during a sleep of the computer, the other stands still."""
 
 
 def clock_pair() -> ClockPair | None:

@@ -35,7 +35,7 @@ _WORDS: Final = {Quantifier.ANY: "any car", Quantifier.ALL: "all cars"}
 
 @dataclass(frozen=True, slots=True)
 class PlanCondition:
-    """An expression, the cars for which it must be true, and the minimum time without a break, s."""
+    """An expression, the cars for which it must be true, and for how many seconds without a break."""
 
     of: Quantifier
     expression: Expression

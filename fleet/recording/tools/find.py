@@ -68,7 +68,7 @@ class ConditionRun:
         """The longest time (s) for which the condition held. Negative if it never did."""
 
     def add(self, topic: str, message: Any, at_ns: int, ahead_ns: int = 0) -> None:
-        """Use a message. `at_ns` is its stamp, `ahead_ns` how far the recorder's clock was ahead of that stamp, ns."""
+        """Use a message. `at_ns` is its stamp. The recorder's clock was ahead of that stamp by `ahead_ns`."""
         # The message has the schema of the recording, which may lack a field.
         if topic == COMMANDS.name and getattr(message, "phase", "") == Phase.SENT:
             self._command = asked_by(message)

@@ -41,8 +41,8 @@ class RecordedMessage(Struct, Generic[Item], frozen=True):
 def as_published(messages: Iterable[RecordedMessage[Item]]) -> Iterator[tuple[int, RecordedMessage[Item]]]:
     """Yield the messages of one computer in the order in which they were published.
 
-    Each message comes with the lead of the recorder's clock over its stamp, ns. This is the lead of the fastest message
-    between two steps, or 0 if it is not larger than network delay and NTP explain.
+    Each message comes with a number of ns by which the recorder's clock was ahead of its stamp. This is the lead of the
+    fastest message between two steps, or 0 if it is not larger than network delay and NTP explain.
     """
     streams: defaultdict[tuple[str, str], list[RecordedMessage[Item]]] = defaultdict(list)
     for each in messages:

@@ -223,7 +223,7 @@ def stops_of(session: Session, about: SessionSummary) -> int:
 
 
 def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[tuple[int, Any]]:
-    """Yield the messages on the keys of a topic, with their times, ns. Read only the chunks that contain one."""
+    """Yield the messages on the keys of a topic, each after its time in ns. Read only the chunks that contain one."""
     decoder = MessageDecoder()
     selected = tuple(key for key in about.keys if key.endswith(f"/{topic}"))
     for info, _, log_ns, _, data in session.rows(Selection(selected)) if selected else ():

@@ -82,7 +82,7 @@ class Backfill:
         self._thread.join()
 
     def request(self, keys: Mapping[str, float]) -> None:
-        """Request a backfill of these keys. Values: age of the last message before the gap, s.
+        """Request a backfill of these keys. Each value is the age, in s, of the last message before the gap.
 
         The gap may be long: while a car is cut off, its gateway keeps publishing, and others hear it only afterwards.
         """

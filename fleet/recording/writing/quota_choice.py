@@ -73,7 +73,7 @@ class Taking(Struct):
     removed: list[str] = field(default_factory=list)
     """Sessions that are removed as a whole."""
     freed: int = 0
-    """Size of all of it, bytes."""
+    """Size, in bytes, of everything that is removed."""
 
 
 def choose(sessions: Sequence[StoredSession], over: int, quota: int) -> Taking:

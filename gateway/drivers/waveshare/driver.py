@@ -407,7 +407,7 @@ class WaveshareDriver(PlainDriver):
             self.recover(words, now)
 
     def _check_stuck(self, turning: list[bool], now: float) -> None:
-        """End a drive in which a wheel stands still, as the speed control would increase its power until it turns."""
+        """End a drive in which a wheel stands still, because the speed control adds power until the wheel turns."""
         held, model = self.queue.held, self._model
         drives = model.motors is Motors.ON and held is not None and held.began_at is not None
         if not drives or all(turning):

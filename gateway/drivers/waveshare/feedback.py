@@ -121,6 +121,6 @@ def _tuple(found: dict[str, Any], names: tuple[str, ...], unit: float) -> Any:
 
 def _number(found: dict[str, Any], name: str) -> float | None:
     value = found.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # nor NaN
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # also rejects NaN
         return None
     return float(value)

@@ -247,7 +247,7 @@ class CarMonitor:
         model.learn(TrustEvent.SILENT, now, words)
 
     def _on_contact(self, now: float) -> None:
-        """Stop the car when it reports again, as a stuck link may deliver all frames of the silence at once."""
+        """Stop the car when it reports again, because a stuck link may deliver all frames of the silence at once."""
         words = f"{self.model.name} sends readings again. The gateway stops it first."
         self._log.log(Level.INFO, "answers_again", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)

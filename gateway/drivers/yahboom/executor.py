@@ -185,7 +185,7 @@ class Executor(Driver):
         return self._prepare(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
-        """Return how long a mode waits at most before its frame is written, s. `busy_s` is the same for a motion."""
+        """Return the longest wait, in s, of a mode until its frame is written. `busy_s` is the same for a motion."""
         model = self.model
         if model.rest_is_sure and self.stops.running is None:
             return max(busy_s, model.pacing.open_at(now, can_show=model.can_show) - now)

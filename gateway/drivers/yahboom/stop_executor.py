@@ -346,7 +346,10 @@ class StopExecutor:
             running.begin_try(sequences.control(interval_s) if is_control else sequences.PROBE, now)
 
     def on_contact(self, now: float, words: str) -> None:
-        """Stop a car that reports again after a silence, as the frames of that time may be lost or arrive at once."""
+        """Stop a car that reports again after a silence.
+
+        The frames that were written during the silence may be lost, or may arrive all at once.
+        """
         running = self.running
         if running is None or running.at_rest:
             self.recover(now, words)

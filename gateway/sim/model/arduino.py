@@ -86,7 +86,7 @@ class ArduinoCar(ModeCar):
         self._buffer.clear()
 
     def _parse(self) -> Generator[Wait, None, bool]:
-        """Obey the string if the program knows it; return True if the string was cleared."""
+        """Obey the string if the program knows it. Return True if this cleared the string."""
         text, head = self._string, self._traits.head
         if text.find("MODE") > 0 and text.find(head) > 0:
             yield from self._mode_frame(text)

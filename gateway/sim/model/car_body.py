@@ -10,7 +10,7 @@ from schemas.geometry import Point
 TOP_SPEED_M_S: Final = 0.5
 """Speed of a wheel at PWM 255."""
 TRACK_M: Final = 0.20
-"""Effective distance of the wheels; larger than the real one, as four wheels skid in a turn."""
+"""Effective distance of the wheels. It is larger than the real one, because four wheels skid in a turn."""
 
 SONAR_AT_M: Final = 0.10
 SONAR_REACH_CM: Final = 499.0
@@ -70,7 +70,7 @@ class CarBody:
         self._left, self._right = left, right
 
     def pose(self, now: float) -> Pose:
-        """Return the true pose; heading in -pi..pi."""
+        """Return the true pose. Its heading is in -pi..pi."""
         self._move(now)
         return Pose(self._x, self._y, (self._heading + pi) % (2 * pi) - pi)
 
@@ -78,7 +78,10 @@ class CarBody:
         return TOP_SPEED_M_S * self._left / 255, TOP_SPEED_M_S * self._right / 255
 
     def glide(self, now: float) -> None:
-        """Move on to `now`, at most one tick, as far as there is room. For a lively world only (see `World.lively`)."""
+        """Move as far as there is room until `now`, which is at most one tick after the last move.
+
+        For a lively world only (see `World.lively`).
+        """
         span = now - self._now
         if span <= 0:
             return

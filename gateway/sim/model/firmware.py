@@ -182,7 +182,10 @@ class Firmware:
             self._arrivals.append((at, byte))
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
-        """Run the program up to `now`; return the pieces sent since then, each with the time of its last byte."""
+        """Run the program up to `now`.
+
+        Return the pieces that the car has sent since the last call, each after the time of its last byte.
+        """
         self._run(now)
         sent = []
         while self._outgoing and self._outgoing[0][0] <= now:

@@ -209,11 +209,13 @@ class ModeEstimator(Struct):
             self._conclude(Verdict.ASSUMED, f"no reading as in mode {self.asked} for {since_s:.1f} s", now)
 
     def unheard_s(self, now: float) -> float:
-        """Return the time without a reading, less the time for which our frames blocked the car, s; at least 0."""
+        """Return how many seconds (0 or more) the car gave no reading although no frame of ours blocked it."""
         return max(0.0, self._silence_s(self._heard_at, now))
 
     def silence_limit(self, *, fan: bool) -> float | None:
-        """Return the longest silence of the commanded mode, s. None if silence shows nothing, or no mode was commanded.
+        """Return the longest normal silence of the commanded mode, in s.
+
+        Return None if silence shows nothing, or if no mode was commanded.
 
         In a mode other than 0, silence shows something only if this car has reported in that mode before.
         """

@@ -77,7 +77,7 @@ _SIGNED: Final = tuple((mode, row, row.signature) for mode, row in MODES.items()
 
 
 def candidate_modes(frame: Sensors) -> tuple[Mode, ...]:
-    """Return the modes whose sensors frame has this text, by its filler; never empty, in order of digit."""
+    """Return the modes whose sensors frame has this text, by its filler. At least one, sorted by digit."""
     return _candidates(frame.raw, frame.terminated, frame.by_silence)
 
 

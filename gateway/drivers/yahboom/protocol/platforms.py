@@ -185,7 +185,7 @@ class Profile(Struct, frozen=True, dict=True):
 
     @cached_property
     def voltage_max(self) -> float:
-        """The maximum of PV, V. A greater value is not a measurement."""
+        """The maximum of PV in V. A greater value is not a measurement."""
         return _PV_MAX[self.cells]
 
     @cached_property
@@ -205,7 +205,7 @@ class Profile(Struct, frozen=True, dict=True):
 
     @property
     def ranging_s(self) -> float:
-        """The maximum time by which a report takes longer if the ranging gets no echo, s."""
+        """The maximum number of seconds by which a report takes longer if the ranging gets no echo."""
         return RANGING_S
 
     @property

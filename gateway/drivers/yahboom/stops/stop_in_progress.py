@@ -61,13 +61,13 @@ def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
 
 
 def evidence_s(profile: Profile, learned: Learned) -> float:
-    """Return the timeout for the evidence of a stop in addition to its worst case, s."""
+    """Return how many seconds to wait for the evidence of a stop, after the time that the stop takes at worst."""
     intervals_s = EVIDENCE_INTERVALS * (learned.echo.median_s + learned.close_s(profile.close_s))
     return min(max(EVIDENCE_TIMEOUT_S, intervals_s), MAX_EVIDENCE_TIMEOUT_S)
 
 
 def report_wait_s(profile: Profile, learned: Learned, *, slowest: bool = False) -> float:
-    """Return the longest time from the last frame of a try to the next report of a car that has obeyed, s.
+    """Return the longest time, in s, from the last frame of a try to the next report of a car that has obeyed.
 
     With `slowest`, the rhythm of the car is not known, so assume the slowest car.
     """
@@ -108,9 +108,9 @@ class StopContext(Struct, frozen=True):
 
     @property
     def turn_s(self) -> float:
-        """Return the longest turn of the mode's loop, during which the car reads nothing, s.
+        """Return how many seconds one turn of the mode's loop takes at most. The car reads nothing during a turn.
 
-        If the mode is not known, it is that of the slowest mode.
+        If the mode is not known, assume the slowest mode.
         """
         known = self.mode is not None and not self.contradicted
         return self.profile.mode_turn_s(self.mode if known and self.mode is not None else Mode.OBSTACLE_AVOIDANCE)
