@@ -169,7 +169,8 @@ class PublisherSequence(Struct):
     """True if the count may restart. A number that neither grows nor fills a gap is then a restart. If False, such
     a number is a duplicate.
 
-    The `seq` of a payload never restarts within one `boot_id`. Zenoh's number begins again with each new publisher.
+    The `seq` of a payload never restarts within one `boot_id`. Zenoh's number begins again with each new publisher. But
+    a backfill may also bring messages from before the first one. They were published before it, so they are no restart.
     """
     first: int = 0
     last: int = 0
@@ -179,17 +180,19 @@ class PublisherSequence(Struct):
     """Number of missing messages in gaps beyond MAX_LISTED_GAPS."""
     gaps: list[Gap] = field(default_factory=list)
     _last_ns: int = 0
+    _first_published_ns: int = 0
 
     @property
     def missing(self) -> int:
         """Return the number of missing messages."""
         return sum(gap.count for gap in self.gaps) + self.unlisted
 
-    def add(self, number: int, received_ns: int) -> bool:
+    def add(self, number: int, received_ns: int, published_ns: int) -> bool:
         """Add the next message in the order of the file. Return True if it is the newest."""
         self.count += 1
         if self.count == 1:
             self.first = self.last = number
+            self._first_published_ns = published_ns
         elif number == self.last + 1:
             self.last = number
         elif number > self.last:
@@ -197,13 +200,13 @@ class PublisherSequence(Struct):
             self.last = number
         elif _fill(self.gaps, number):
             return False
-        elif self.restarts:
-            self.last = number
-        elif number < self.first:
+        elif number < self.first and (not self.restarts or published_ns < self._first_published_ns):
             if number < self.first - 1:
                 self._add_gap(Gap(number + 1, self.first - 1, received_ns, received_ns))
-            self.first = number
+            self.first, self._first_published_ns = number, published_ns
             return False
+        elif self.restarts:
+            self.last = number
         else:
             self.duplicates += 1
             return False

@@ -176,7 +176,7 @@ class _Verifier:
             stream = self._streams.get((key, publisher))
             if stream is None:
                 stream = self._streams[key, publisher] = PublisherSequence(restarts=not own)
-            newest = stream.add(number, log_ns)
+            newest = stream.add(number, log_ns, publish_ns)
         self._publisher_clock(owner, (key, publisher), log_ns, publish_ns, newest=newest)
 
     def _check_schema(self, info: ChannelInfo) -> type[Message] | None:

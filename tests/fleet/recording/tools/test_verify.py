@@ -41,11 +41,11 @@ class Written:
         payload = pb.Range(car="red", seq=seq, boot_id=boot, range_m=1).SerializeToString()
         self._writer.add_message(self._ids[key], self.now, payload, self.now - took_ms * MS, seq)
 
-    def raw(self, key: str, payload: bytes, sequence: int) -> None:
+    def raw(self, key: str, payload: bytes, sequence: int, *, took_ms: int = 0) -> None:
         self.now += 10 * MS
         if key not in self._ids:
             self._ids[key] = self._writer.register_channel(key, "json", 0)
-        self._writer.add_message(self._ids[key], self.now, payload, self.now, sequence)
+        self._writer.add_message(self._ids[key], self.now, payload, self.now - took_ms * MS, sequence)
 
     def verdict(self) -> SessionVerdict:
         self._writer.finish()
@@ -114,6 +114,14 @@ def test_numbers_that_may_begin_again_are_no_gap(written: Written) -> None:
     assert written.verdict().whole
 
 
+def test_backfill_from_before_first_message_is_no_restart(written: Written) -> None:
+    for seq, took_ms in ((5, 0), (3, 500), (4, 400), (6, 0), (1, 900), (7, 0)):
+        written.raw("fleet/note", b"{}", seq, took_ms=took_ms)
+    verdict = written.verdict()
+    assert gaps(verdict) == [("fleet/note", "", 2, 2, 1)]
+    assert not verdict.twice
+
+
 def test_any_order_and_any_loss_is_counted_right() -> None:
     for seed in range(300):
         chance = random.Random(seed)
@@ -123,7 +131,7 @@ def test_any_order_and_any_loss_is_counted_right() -> None:
         chance.shuffle(heard := kept + twice)
         stream = PublisherSequence()
         for at, number in enumerate(heard):
-            stream.add(number, at)
+            stream.add(number, at, number)
         assert stream.missing == max(kept) - min(kept) + 1 - len(kept), seed
         assert stream.duplicates == len(twice), seed
         listed = {number for gap in stream.gaps for number in range(gap.first, gap.last + 1)}
@@ -133,7 +141,7 @@ def test_any_order_and_any_loss_is_counted_right() -> None:
 def test_more_gaps_than_are_listed_are_counted() -> None:
     stream = PublisherSequence()
     for number in range(1, 4 * MAX_LISTED_GAPS, 2):
-        stream.add(number, number)
+        stream.add(number, number, number)
     assert len(stream.gaps) == MAX_LISTED_GAPS
     assert stream.missing == 2 * MAX_LISTED_GAPS - 1
 
