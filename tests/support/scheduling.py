@@ -25,7 +25,7 @@ SUITES: Final = "SUITES_AT_ONCE"
 """Environment variable: number of suites that share this machine (`make stress`), each with its part of the workers."""
 SUITE: Final = "SUITE_NUMBER"
 """Environment variable: index of this suite, from 0. Each suite has its part of the ports."""
-RESERVE_PER_PROCESSOR: Final = 1.5
+RESERVE_PER_PROCESSOR: Final = 2.0
 """Workers in reserve per processor."""
 _PROCESSORS: Final = max(1, (os.cpu_count() or 1) // int(os.environ.get(SUITES, "1")))
 _FOREGROUND: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS)
