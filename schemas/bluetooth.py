@@ -8,7 +8,8 @@ SMALL_ADAPTER_CONNECTIONS: Final = 3
 """Number of connections that the smallest adapters can hold (issue 1858 of bleak)."""
 ADAPTER_NOTIFICATIONS_PER_S: Final = 165
 """Notifications per second that an adapter carries (docs/explanation/measurements.md#bluetooth)."""
-# In tracking, a car sends up to 27 reports a second (docs/reference/protocol.md#rates), each in 3 pieces of 20 bytes.
+# In tracking, a car sends up to 27 reports of 35 bytes a second (docs/reference/protocol.md#rates). A report takes two
+# pieces of 20 bytes, or three if it does not begin with a piece.
 CAR_NOTIFICATIONS_PER_S: Final = 27 * 3
 """Maximum notifications per second from one car."""
 ADAPTER_FULL: Final = "Bluetooth adapter is full"
