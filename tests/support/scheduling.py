@@ -10,6 +10,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable
 from enum import Enum, auto
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -105,10 +106,13 @@ def _group(item: pytest.Item) -> str:
     return str((*mark.args, *mark.kwargs.values())[0]) if mark is not None else ""
 
 
-def kind_of(worker: str, workers: int, tests: Iterable[str]) -> WorkerKind:
-    """Return the kind of a worker (such as `gw7`) in a run of tests with these ids."""
-    if sum(not computes(each) for each in tests) < _MIN_WAITING or workers != WORKERS:
-        return WorkerKind.FOREGROUND
+def are_divided(workers: int, tests: Iterable[str]) -> bool:
+    """Return True if the workers are of different kinds in a run of tests with these ids."""
+    return workers == WORKERS and sum(not computes(each) for each in tests) >= _MIN_WAITING
+
+
+def kind_of(worker: str) -> WorkerKind:
+    """Return the kind of a worker (such as `gw7`) if the workers are divided."""
     index = int(worker.removeprefix("gw"))
     if index < _FOREGROUND:
         return WorkerKind.FOREGROUND
@@ -120,7 +124,7 @@ def lower_priority(config: pytest.Config, tests: Iterable[str]) -> None:
     given = getattr(config, "workerinput", None)
     if given is None or not hasattr(os, "nice"):
         return
-    if kind_of(given["workerid"], given["workercount"], tests) == WorkerKind.BACKGROUND:
+    if kind_of(given["workerid"]) == WorkerKind.BACKGROUND and are_divided(given["workercount"], tests):
         os.nice(_LOWEST_PRIORITY)
         if _AUTOGROUP.exists():
             os.setsid()
@@ -135,8 +139,6 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
         config.option.loadscopereorder = False  # `sort` has done it
         self._scopes: dict[str, str] = {}
         self._short: Counter[str] = Counter()
-        self._kinds: dict[str, WorkerKind] = {}
-        self._reserve_called = False
 
     def _split_scope(self, nodeid: str) -> str:
         """Return the work unit of a test."""
@@ -167,9 +169,6 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
 
     def _call_reserve(self) -> None:
         """Give the workers in reserve their first tests."""
-        if self._reserve_called:
-            return
-        self._reserve_called = True
         for node in self.nodes:
             if self._kind_of(node) == WorkerKind.RESERVE:
                 self._reschedule(node)
@@ -177,7 +176,8 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
 
     def _kind_of(self, node: WorkerController) -> WorkerKind:
         """Return the kind of a worker."""
-        worker = node.gateway.id
-        if worker not in self._kinds:
-            self._kinds[worker] = kind_of(worker, self.numnodes, self.collection or ())
-        return self._kinds[worker]
+        return kind_of(node.gateway.id) if self._are_divided else WorkerKind.FOREGROUND
+
+    @cached_property
+    def _are_divided(self) -> bool:
+        return are_divided(self.numnodes, self.collection or ())
