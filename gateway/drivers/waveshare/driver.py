@@ -1,7 +1,7 @@
 """Drives one car of Waveshare's UGV family. Pure.
 
 These cars accept JSON, one object per line, over a UART. They acknowledge nothing by themselves, but have two things
-that the yahboom family lacks: a dead-man timer, and on some chassis encoders. This text says how the driver uses them.
+that the yahboom family lacks: a dead-man timer, and on some chassis encoders.
 
 *One number, three meanings.* `{"T":1,"L":0.4,"R":0.4}` is 0.4 m/s on a chassis with encoders, four fifths of full power
 on one without, and nearly nothing on the factory's first program. The command looks the same for all three. So no
@@ -27,8 +27,7 @@ until the car has repeated them. A car that repeats no line gets them three time
 interval that we asked for, else ten times. Then it may be driven, although it cannot confirm them.
 
 *The first bytes.* At each boot, the car plays a mission that its owner may have stored, and any byte on the UART aborts
-it. So after the link is open we listen before we write, and wait for the end of a boot. Only a person's stop does not
-wait.
+it. So after the link is open we listen first, and wait for the end of a boot. Only a person's stop does not wait.
 
 *Other programs.* The car has a web page with a known password, and accepts commands by radio. Commands of either kind
 reset the dead-man timer. So if wheels turn while our last command is a stop, that is logged, and the car is stopped. No
@@ -159,7 +158,6 @@ class WaveshareDriver(PlainDriver):
         self._sent: deque[tuple[bytes, float]] = deque(maxlen=64)
         self._number = 0
         """Number of the last frame of a stop. It is in the frame, so that its echo can be recognized."""
-        self._firmware: UgvFirmware | None = None
         self._moved_at = float("-inf")
         """When the last motion was written."""
         self._named_at = float("-inf")
@@ -167,8 +165,9 @@ class WaveshareDriver(PlainDriver):
         self._answered_at = float("-inf")
         self._forget_car(float("-inf"))
 
-    def _forget_car(self, listen_until: float) -> None:
-        """Forget everything that a reset of the car changes."""
+    def _forget_car(self, listen_until: float, firmware: UgvFirmware | None = None) -> None:
+        """Forget everything that a reset of the car changes, and if it is not given, the firmware."""
+        self._firmware = firmware
         self._setup, self._setup_at = Setup.LISTEN, listen_until
         self._listen_until = listen_until + LISTEN_MAX_S
         self._booting = False
@@ -212,9 +211,7 @@ class WaveshareDriver(PlainDriver):
         self._setup_at = min(self._listen_until, max(self._setup_at, now + BOOT_QUIET_S))
 
     def _events(self, text: bytes, now: float) -> list[Event]:
-        while self._sent and now > self._sent[0][1] + ECHO_S:
-            self._sent.popleft()
-        if any(text == each for each, _ in self._sent):
+        if any(text == each and now <= at + ECHO_S for each, at in self._sent):
             return [Echo(text, now)]
         return read_line(text, now)
 
@@ -234,8 +231,10 @@ class WaveshareDriver(PlainDriver):
         topics: dict[str, Fields] = {}
         if self._is_measured:
             topics["sensor/wheels"] = {"left_m_s": event.left_m_s, "right_m_s": event.right_m_s}
-        if event.voltage_v is not None and self._is_new_voltage(event.voltage_v, event.at):
-            topics["sensor/battery"] = {"voltage_v": event.voltage_v}
+        volts, (published_v, published_at) = event.voltage_v, self._voltage
+        if volts is not None and (volts != published_v or event.at >= published_at + VOLTAGE_S):
+            self._voltage = volts, event.at
+            topics["sensor/battery"] = {"voltage_v": volts}
         if self._setup is not Setup.READY or self._here is None:
             return topics  # before the set-up, an angle may be that of an arm, and the chassis may be another one
         if event.odometer_m is not None:
@@ -246,14 +245,6 @@ class WaveshareDriver(PlainDriver):
             names = [f"{part}_{axis}_raw" for part in ("gyro", "accel") for axis in "xyz"]
             topics["sensor/imu"] = dict(zip(names, event.imu_raw, strict=True))
         return topics
-
-    def _is_new_voltage(self, volts: float, at: float) -> bool:
-        """Return True if a voltage has to be published, because it is new or was last published a while ago."""
-        before, measured_at = self._voltage
-        if volts == before and at < measured_at + VOLTAGE_S:
-            return False
-        self._voltage = volts, at
-        return True
 
     @property
     def _here(self) -> Chassis | None:
@@ -305,7 +296,7 @@ class WaveshareDriver(PlainDriver):
         """Repeat the set-up before the car may be driven: its reset has undone chassis, dead-man time and stream."""
         words = f"{self._model.name} has restarted: {why}. The gateway sets it up again, and stops it first."
         self._log.log(Level.WARNING, "car_restarted", words, now)
-        self._forget_car(now + BOOT_QUIET_S)
+        self._forget_car(now + BOOT_QUIET_S, self._firmware)
         self.recover(words, now)
         if now > self._moved_at + ON_ITS_WAY_S:
             self._wait_for_setup()  # else a motion of ours may still be on its way, and the stop must follow it at once
@@ -427,7 +418,6 @@ class WaveshareDriver(PlainDriver):
     def link_up(self, now: float) -> None:
         """Listen before anything is written, because the link is open now and the car may boot."""
         self._lines = LineSplitter()
-        self._firmware = None
         self._forget_car(now + LISTEN_S)
         super().link_up(now)
         self._wait_for_setup()
@@ -452,7 +442,6 @@ class WaveshareDriver(PlainDriver):
         super().tick(now)
         if was_heard and not self._model.is_heard:
             self._forget_car(now)
-            self._firmware = None
 
     def wait_words(self, now: float) -> str:
         """Describe what must happen before the car may be driven."""
@@ -563,18 +552,14 @@ class WaveshareDriver(PlainDriver):
         """Return the lines that switch the lights, which are at the two switched outputs."""
         match what:
             case SetLight(Light.WHITE | Light.OFF as light):
-                return (_light(is_on=light is Light.WHITE),)
+                states = [light is Light.WHITE]
             case Find():
-                return tuple(_light(is_on=index % 2 == 0) for index in range(6))
+                states = [True, False] * 3
             case _:
                 return None
+        return tuple(line(OUTPUTS, IO4=255 * is_on, IO5=255 * is_on) for is_on in states)
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail all commands, because the link is down, and forget the car's state."""
         super().link_down(reason, now, cause=cause)
-        self._firmware = None
         self._forget_car(now)
-
-
-def _light(*, is_on: bool) -> bytes:
-    return line(OUTPUTS, IO4=255 * is_on, IO5=255 * is_on)
