@@ -28,6 +28,9 @@ from tests.support.virtual import Pair
 
 LOOK_S = 0.2
 """Interval at which a gateway checks its states."""
+MODE_TRIES = 3
+"""How often a mode is commanded if it expires. Without an echo, the eight actions of a full queue take 35 s at most (a
+`Find` has four frames, 1.1 s apart), and each command waits for 15 s."""
 SETTLED_S = 2.5
 """Pause after a change of mode. The closing block may lose an earlier frame, and an alarm about that loss is true."""
 ALARMS = frozenset(
@@ -66,6 +69,8 @@ class NormalRun:
         self.health = LinkHealth()
         self.alarms: list[str] = []
         self.commands = 0
+        self._mode_expired = False
+        """True if a mode command has waited too long behind actions."""
         heard = self.pair.control.driver.on_event
 
         def counted(event: Event, now: float) -> None:
@@ -106,6 +111,7 @@ class NormalRun:
             failed = record.phase is Phase.FAILED or (record.reason is not None and record.reason not in EXPECTED)
             if failed:
                 self._alarm(f"{record.command.verb} {record.phase}: {record.words}")
+            self._mode_expired |= record.phase is Phase.EXPIRED and isinstance(record.command.what, SetMode)
         pair.logs.clear()
         pair.records.clear()
         del pair.sent[:-6]
@@ -118,12 +124,18 @@ class NormalRun:
 
     def go(self, mode: Mode) -> None:
         """Bring the car to a mode, and wait until its true mode is this one."""
+        assert any(self._reaches(mode) for _ in range(MODE_TRIES)), f"{mode} expired {MODE_TRIES} times"
+        self.run(SETTLED_S)
+
+    def _reaches(self, mode: Mode) -> bool:
+        """Command a mode. Return True when it is the true mode, or False if the command waited too long."""
+        self._mode_expired = False
         self.ask(SetMode(mode))
         end = self.pair.now + 20.0
-        while self.pair.car.truth.mode is not mode:
+        while self.pair.car.truth.mode is not mode and not self._mode_expired:
             assert self.pair.now < end, f"{mode} was not reached"
             self.run(LOOK_S)
-        self.run(SETTLED_S)
+        return not self._mode_expired
 
     def _alarm(self, words: str) -> None:
         if len(self.alarms) < 20:
