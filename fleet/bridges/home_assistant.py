@@ -27,7 +27,7 @@ from schemas import keys
 from schemas.words import UNKNOWN, BatteryLevel, LinkState, Mode, Motors
 
 BASE: Final = "car-fleet"
-"""First part of all topics except those of the announcements."""
+"""First part of our topics, but for those that Home Assistant defines: announcements, and its birth message."""
 DISCOVERY_PREFIX: Final = "homeassistant"
 """Home Assistant's own default."""
 ONLINE: Final = "online"

@@ -39,7 +39,8 @@ NEVER_HEARD: Final = "nothing was heard from it yet"
 _MAX_KNOWN_ENDED: Final = 8
 """Number of ended gateways that are remembered for each car, to recognize their late messages."""
 LATE_MESSAGE_NS: Final = 2_000_000_000
-"""A message of an ended gateway counts only if its stamp is newer than all others by more than this time."""
+"""A message of an ended gateway counts only if its stamp is newer than all others by more than this time: two of the
+intervals in which each running gateway publishes its states (1 s)."""
 _UNHEARD_S: Final = 3.0
 """Silence after which a car counts as unheard if the state of its motors is unknown."""
 

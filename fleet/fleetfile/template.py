@@ -29,7 +29,7 @@ def quote(text: str) -> str:
 
 
 def format_key(name: str) -> str:
-    """Format a car's name as a YAML key, in quotes if YAML would read it as a number (`10`) or as null."""
+    """Format a car's name as a YAML key, in quotes if YAML would read it as a number (`10`), a boolean or null."""
     return name if name[0].isalpha() and name not in ("null", "true", "false") else quote(name)
 
 

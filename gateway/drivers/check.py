@@ -52,7 +52,7 @@ FIRST_STOP_S: Final = 1.0
 """Maximum time from a person's stop to its first frame, unless the driver announces a longer worst case."""
 JOINED_S: Final = 7.0
 """A new stop may join a running one, whose frames then count for it. They may be at most this much older than the new
-stop."""
+stop. The number is one second more than the interval of a stop's repeats in both families (6.0 s)."""
 MAX_FRAMES_AT_ONCE: Final = 50
 ACTIONS: Final[tuple[Action, ...]] = (
     Led(1, 2, 3),

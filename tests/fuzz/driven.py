@@ -143,7 +143,10 @@ class Driven:
 
 
 def wedged(pair: Pair) -> bool:
-    """Return True for the one string that no frame of recovery clears ("in_one_millisecond" in the tests of stops)."""
+    """Return True for the one string that no frame of recovery clears.
+
+    See `test_recovery_of_car_that_wakes_for_one_millisecond`.
+    """
     return isinstance(pair.car, ArduinoCar) and pair.car._string.startswith("4WD")
 
 
