@@ -17,6 +17,9 @@ pytestmark = pytest.mark.xdist_group(GROUP)
 TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
 """Classes of the SDK that have an asyncio twin of the same name in fleet/aio.py."""
 
+POSIX = frozenset({"fcntl", "grp", "pty", "pwd", "readline", "resource", "syslog", "termios", "tty"})
+"""Modules of the standard library that exist on POSIX systems only."""
+
 LAZY_IMPORTS = 142
 """Maximum number of imports inside functions. Each of them shortens the start of a command line."""
 
@@ -102,6 +105,19 @@ def stray_texts(path: Path) -> Iterator[str]:
 def test_text_is_never_a_statement_of_its_own() -> None:
     """A message of two parts had lost its second one: the parenthesis was closed too early."""
     assert [each for path in source_files(*PACKAGES) for each in stray_texts(path)] == []
+
+
+def test_posix_modules_are_imported_only_where_the_system_has_them() -> None:
+    """Windows has none of them. Such an import stands in a function, in `try`, or behind a look at the system."""
+    found = [
+        f"{module_name(path)}: {alias.name}"
+        for path in source_files(*PRODUCT)
+        for node in parsed(path).body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in ([ast.alias(node.module or "")] if isinstance(node, ast.ImportFrom) else node.names)
+        if alias.name in POSIX
+    ]
+    assert found == []
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -271,7 +271,11 @@ def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
         raise click.UsageError(
             f"No paired device has the id or person {missing[0]!r}. `fleet console people` lists them."
         )
-    for each in file.change(lambda book: book.revoke(names)):
+    try:
+        revoked = file.change(lambda book: book.revoke(names))
+    except OSError as error:
+        raise _not_written(file, error) from None
+    for each in revoked:
         click.echo(f"{each.id} ({each.person.name}) is revoked. Its pages are closed.")
 
 
@@ -318,8 +322,12 @@ def _show_code(people: PeopleFile, address: str, person: PagePerson) -> None:
     try:
         code = network.issue_code(people, person)
     except OSError as error:
-        raise click.ClickException(f"{people.path} cannot be written: {error.strerror}") from None
+        raise _not_written(people, error) from None
     network.show_code(address, code, person, click.echo, draws=sys.stdout.isatty())
+
+
+def _not_written(people: PeopleFile, error: OSError) -> click.ClickException:
+    return click.ClickException(f"{people.path} cannot be written: {error.strerror}")
 
 
 def _own_name() -> str:

@@ -1,6 +1,5 @@
 """The console's certificate for HTTPS: one key for each user, and a certificate for this computer's names."""
 
-import fcntl
 import hashlib
 import os
 import ssl
@@ -17,6 +16,7 @@ from msgspec import Struct
 
 from fleet.hub.x509_parts import builder, common_name, end_entity, new_key, pem, private_pem
 from schemas.atomic_file import write_atomically
+from schemas.process.file_lock import FileLock
 from schemas.state_dir import default_directory
 
 RENEWAL_BEFORE: Final = timedelta(days=30)
@@ -64,10 +64,8 @@ def ensure_certificate(names: Iterable[str], now: datetime | None = None, direct
     """
     now = datetime.now(UTC) if now is None else now
     directory = default_directory() / "console" if directory is None else directory
-    directory.mkdir(parents=True, exist_ok=True)
     current = tuple(dict.fromkeys(names))[:MAX_NAMES]
-    with (directory / "lock").open("a") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    with FileLock(directory / "lock").held():
         key_path, path = directory / "key.pem", directory / "certificate.pem"
         key = _ensure_key(key_path)
         found = _read(path, key_path, key)

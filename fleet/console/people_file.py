@@ -3,7 +3,6 @@
 The console and `fleet console people` share it, so each change is made under a lock.
 """
 
-import fcntl
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -46,9 +45,7 @@ class PeopleFile:
 
     def change(self, function: Callable[[PeopleBook], tuple[PeopleBook, T]]) -> T:
         """Replace the book by the first value that the function returns. Return its second value. Raises OSError."""
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.with_name(f"{self.path.name}.lock").open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with FileLock(self.path.with_name(f"{self.path.name}.lock")).held():
             book, value = function(self._load())
             write_atomically(self.path, book.as_text().encode(), sync=True, private=True)
         return value

@@ -6,9 +6,8 @@ so that its earlier certificate stays invalid.
 
 import json
 import os
-import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
@@ -38,9 +37,6 @@ from schemas.process.file_lock import FileLock
 CA_KEY_FILE: Final = "ca.key"
 IDENTITIES_FILE: Final = "identities.json"
 LOCK_FILE: Final = "lock"
-LOCK_TIMEOUT_S: Final = 10.0
-"""Maximum time to wait for a change by another program. A change takes some milliseconds."""
-LOCK_POLL_S: Final = 0.02
 
 
 class BrokenHub(BusError):
@@ -104,17 +100,14 @@ class HubStore(Struct):
     @contextmanager
     def _changing(self) -> Iterator[None]:
         """Lock the files against changes by other programs, and read them again. Raises OSError, BrokenHub."""
-        path, deadline = self.directory / LOCK_FILE, time.monotonic() + LOCK_TIMEOUT_S
-        lock = FileLock(path)
-        while not lock.try_take():
-            if time.monotonic() > deadline:
-                raise BrokenHub(f"another program is changing the hub's files and holds {path}: try again")
-            time.sleep(LOCK_POLL_S)
-        try:
+        path = self.directory / LOCK_FILE
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(FileLock(path).held())
+            except TimeoutError:
+                raise BrokenHub(f"another program is changing the hub's files and holds {path}: try again") from None
             self._read_known()
             yield
-        finally:
-            lock.release()
 
     @property
     def directory(self) -> Path:

@@ -1,7 +1,11 @@
 """A lock between the processes of one user: a locked file. It ends with its holder, even if the holder is killed."""
 
+import errno
 import os
 import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -10,11 +14,14 @@ if sys.platform == "win32":
 else:
     import fcntl
 
+LOCK_TIMEOUT_S: Final = 10.0
+"""Maximum time for which `held` waits. A change of a file by another program takes some milliseconds."""
+_LOCK_POLL_S: Final = 0.02
 _MODE: Final = 0o600
 
 
 class FileLock:
-    """A lock on one file, which is made if it is missing. It never waits: the caller tries again."""
+    """A lock on one file, which is made if it is missing."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -41,6 +48,19 @@ class FileLock:
             return False
         self._descriptor = descriptor
         return True
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Wait for the lock, hold it, and release it. Raises TimeoutError if another one holds it, else OSError."""
+        deadline = time.monotonic() + LOCK_TIMEOUT_S
+        while not self.try_take():
+            if time.monotonic() > deadline:
+                raise TimeoutError(errno.ETIMEDOUT, "another program holds it: try again", str(self._path))
+            time.sleep(_LOCK_POLL_S)
+        try:
+            yield
+        finally:
+            self.release()
 
     def release(self) -> None:
         """Release the lock. The file stays, as another process may have it open already."""

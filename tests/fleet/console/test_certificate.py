@@ -6,11 +6,14 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from fleet.cli import cli
 from fleet.console import certificate, network_console
 from fleet.console.certificate import BadKeyFile, ensure_certificate, needs_renewal
 from fleet.console.pairing import PagePerson, PeopleBook
-from fleet.console.people_file import PeopleFile
+from fleet.console.people_file import PeopleFile, people_path
+from schemas.bus import resolve_endpoint
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 
@@ -87,3 +90,15 @@ def test_people_file_is_private_shared_and_survives_damage(tmp_path: Path) -> No
     assert [each.id for each in theirs.read().devices] == ["d"]
     path.write_text("{")
     assert theirs.read() == PeopleBook()
+
+
+def test_revoking_tells_that_people_file_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    people = PeopleFile(people_path(resolve_endpoint(None), "fleet"))
+    people.change(lambda book: (book.issue("K7QF3MXP", PagePerson("mia"), 1.8e9), None))
+    people.change(lambda book: (book.redeem("K7QF3MXP", "c", "d", "", 1.8e9) or book, None))
+    lock = people.path.with_name(f"{people.path.name}.lock")
+    lock.unlink()
+    lock.mkdir()
+    failed = CliRunner().invoke(cli, ["console", "people", "--revoke", "mia"])
+    assert (failed.exit_code, str(people.path) in failed.stderr) == (1, True), failed.output

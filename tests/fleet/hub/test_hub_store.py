@@ -202,7 +202,7 @@ def test_damaged_certificate_authority_is_named(name: str, tmp_path: Path) -> No
 
 def test_store_change_waits_for_lock_but_not_for_killed_holder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = store_in(tmp_path)
-    monkeypatch.setattr("fleet.hub.hub_store.LOCK_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("schemas.process.file_lock.LOCK_TIMEOUT_S", 0.1)
     holder = (
         "import sys, time; from pathlib import Path; from schemas.process.file_lock import FileLock;"
         "lock = FileLock(Path(sys.argv[1])); print(lock.try_take(), flush=True); time.sleep(1e6)"

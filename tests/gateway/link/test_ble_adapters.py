@@ -58,32 +58,6 @@ async def refused(url: LinkUrl) -> str:
 
 # ---------------------------------------------------------------------- turns
 
-HOLDS = """
-import sys, time
-from pathlib import Path
-from schemas.process.file_lock import FileLock
-print(FileLock(Path(sys.argv[1])).try_take(), flush=True)
-time.sleep(600)
-"""
-
-
-def test_file_lock_ends_with_its_holder(tmp_path: Path) -> None:
-    path = tmp_path / "not" / "yet" / "there"
-    with subprocess.Popen([sys.executable, "-c", HOLDS, str(path)], stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "True\n"
-        mine = FileLock(path)
-        assert not mine.try_take()
-        holder.kill()
-        holder.wait()
-    assert mine.try_take()
-    assert mine.try_take(), "it is held already"
-    assert not FileLock(path).try_take()
-    mine.release()
-    mine.release()
-    assert not mine.is_held
-    assert FileLock(path).try_take()
-
 
 def test_ble_turn_of_moving_car_goes_first(tmp_path: Path) -> None:
     holder, ordinary, other = (Turn("hci0", first=False, directory=tmp_path) for _ in range(3))
