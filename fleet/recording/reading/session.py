@@ -98,8 +98,10 @@ class Session:
                 # Glob hides a missing permission. Listing the directory raises it.
                 next(path.iterdir(), None)
                 raise NoSession(f"{path} is not a session: no {session_dir.segment(Path(), 1)} in it")
-            if not whole and not path.exists():
-                raise NoSession(f"There is no session at {path}. {_near(path)}`fleet sessions` lists them.")
+            if not whole:
+                path.stat()  # since Python 3.14, `exists` hides a missing permission
+        except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a null byte
+            raise NoSession(f"There is no session at {path}. {_near(path)}`fleet sessions` lists them.") from None
         except OSError as error:
             raise NoSession(f"{path} cannot be read: {error.strerror}") from None
         self.path = path
