@@ -109,5 +109,5 @@ def _read(path: Path, key_path: Path, key: Any) -> Certificate | None:
 
 def _signed(key: ec.EllipticCurvePrivateKey, names: tuple[str, ...], now: datetime) -> bytes:
     subject = common_name("fleet console")
-    begun = builder(subject, subject, key.public_key(), now)
+    begun = builder(subject, subject, key.public_key(), key.public_key(), now)
     return pem(end_entity(begun, (ExtendedKeyUsageOID.SERVER_AUTH,), names).sign(key, hashes.SHA256()))

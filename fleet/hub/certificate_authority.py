@@ -38,7 +38,7 @@ def make_authority(now: datetime) -> KeyPair:
     """Return a new authority."""
     key, name = new_key(), common_name("car fleet hub authority")
     made = (
-        builder(name, name, key.public_key(), now, CA_LIFETIME)
+        builder(name, name, key.public_key(), key.public_key(), now, CA_LIFETIME)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(key_usage(signs=True), critical=True)
         .sign(key, hashes.SHA256())
@@ -172,5 +172,5 @@ def _signed(
 ) -> bytes:
     ca_key: Any = serialization.load_pem_private_key(authority.key, None)
     ca = x509.load_pem_x509_certificate(authority.certificate)
-    begun = builder(common_name(name), ca.subject, key, now)
+    begun = builder(common_name(name), ca.subject, key, ca_key.public_key(), now)
     return pem(end_entity(begun, usages, names).sign(ca_key, hashes.SHA256()))

@@ -35,9 +35,12 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 
 def builder(
-    subject: x509.Name, issuer: x509.Name, key: Any, now: datetime, lifetime: timedelta = LIFETIME
+    subject: x509.Name, issuer: x509.Name, key: Any, issuer_key: Any, now: datetime, lifetime: timedelta = LIFETIME
 ) -> x509.CertificateBuilder:
-    """Return the beginning of a certificate for a public key."""
+    """Return the beginning of a certificate for a public key. `issuer_key` is that of the authority, public, too.
+
+    Since Python 3.13, its default settings reject certificates without the identifiers of both keys (RFC 5280, 4.2.1).
+    """
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -46,6 +49,8 @@ def builder(
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - _BACKDATED)
         .not_valid_after(now + lifetime)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key), critical=False)
     )
 
 

@@ -1,6 +1,7 @@
 """Certificates, as OpenSSL judges them."""
 
 import ssl
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,29 @@ def test_signed_certificate_ignores_name_in_request(ca: certificate_authority.Ke
     (tmp_path / "key").write_bytes(key)
     (tmp_path / "pem").write_bytes(made)
     ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT).load_cert_chain(tmp_path / "pem", tmp_path / "key")
+
+
+@pytest.mark.parametrize("strict", [True, False])
+def test_hub_is_accepted_by_strict_clients_too(strict: bool, tmp_path: Path) -> None:
+    """Since Python 3.13, its default settings are strict."""
+    now = datetime.now(UTC)
+    ca = certificate_authority.make_authority(now)
+    hub = certificate_authority.issue(ca, "hub", now, ["127.0.0.1"])
+    (tmp_path / "both").write_bytes(hub.certificate + hub.key)
+    server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    server.load_cert_chain(tmp_path / "both")
+    client = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    client.load_verify_locations(cadata=ca.certificate.decode())
+    client.verify_flags |= ssl.VERIFY_X509_STRICT if strict else 0
+    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
+    ends = (
+        client.wrap_bio(to_client, to_server, server_hostname="127.0.0.1"),
+        server.wrap_bio(to_server, to_client, server_side=True),
+    )
+    for end in ends * 3:
+        with suppress(ssl.SSLWantReadError):
+            end.do_handshake()
+    assert ends[1].cipher() is not None
 
 
 @pytest.mark.parametrize("request_bytes", [b"", b"junk", b"-----BEGIN CERTIFICATE REQUEST-----\nAAAA\n"])
