@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from stat import S_ISDIR
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
@@ -391,7 +392,9 @@ def existing_sessions_place(directory: Path | None) -> Path:
     """Return this directory of sessions, or the default one. Raises a ClickException if it does not exist."""
     place = directory or sessions_place()
     try:
-        is_there = place.is_dir()
+        is_there = S_ISDIR(place.stat().st_mode)  # since Python 3.14, `is_dir` hides a missing permission
+    except (FileNotFoundError, NotADirectoryError):
+        is_there = False
     except OSError as error:  # we may not enter a directory on the way
         raise click.ClickException(f"{place} cannot be listed: {error.strerror}.") from None
     if not is_there:

@@ -137,11 +137,13 @@ def _summaries(directory: Path | None) -> list["SessionSummary"]:
 
     place = directory or sessions_place()
     try:
-        found = list(overviews(place)) if directory is not None or place.exists() else []
+        found = list(overviews(place))
     except OSError as error:
         is_missing = isinstance(error, FileNotFoundError)
-        why = f"There is no directory {place}." if is_missing else f"{place} cannot be listed: {error.strerror}."
-        raise click.ClickException(f"{why} `fleet sessions` without DIR lists the sessions here.") from None
+        if not is_missing or directory is not None:
+            why = f"There is no directory {place}." if is_missing else f"{place} cannot be listed: {error.strerror}."
+            raise click.ClickException(f"{why} `fleet sessions` without DIR lists the sessions here.") from None
+        found = []
     if not found:
         click.echo(f"No recordings here yet (in {place}). `fleet up` records everything.", err=True)
     return found
