@@ -410,7 +410,7 @@ class Driver(ABC):
         """Return when a motion can be sent to the car, as far as that is known."""
 
     def wait_words(self, now: float) -> str:
-        """Describe what must happen before the car may be driven. Empty if it may be driven now."""
+        """Name what must happen before the car may be driven, such as `its set-up`. Empty if it may be driven now."""
         del now
         return ""
 
@@ -557,6 +557,7 @@ class Driver(ABC):
                     words = f"began after {waited_s:.1f} s: {car} was busy"
                 self.release(Phase.COMPLETE, None, words, now)
             else:  # the frame of the drive could not be written in all that time
-                waited_s = now - held.pending.received_at
-                self.release(Phase.EXPIRED, Reason.EXPIRED, f"{car} was busy for {waited_s:.1f} s", now)
+                waited_s, waits = now - held.pending.received_at, self.wait_words(now)
+                words = f"{car} waits for {waits}" if waits else f"{car} was busy for {waited_s:.1f} s"
+                self.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
         self.queue.expire(now)

@@ -25,6 +25,8 @@ BUILT_IN: Final = {
 }
 """Module of each family that comes with the gateway."""
 GROUP: Final = "zenoh_car_fleet.drivers"
+NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
+"""The names of `Family`."""
 broken: Final[dict[str, str]] = {}
 """The drivers of other packages that could not be imported, with the reason."""
 
@@ -167,7 +169,13 @@ def _installed() -> tuple[tuple[str, Family], ...]:
     found = []
     for each in entry_points(group=GROUP):
         try:
-            found.append((each.name, cast("Family", each.load())))
-        except Exception as error:  # noqa: BLE001 - a mistake in one package must not keep the cars of others from running
+            family = cast("Family", each.load())
+            missing = [name for name in NAMES if not hasattr(family, name)]
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a mistake here must not keep other cars from running
             broken[each.name] = f"{each.value} cannot be imported: {type(error).__name__}: {error}"
+            continue
+        if missing:
+            broken[each.name] = f"{each.value} has no {', '.join(missing)}"
+        else:
+            found.append((each.name, family))
     return tuple(found)

@@ -32,10 +32,10 @@ from gateway.control.commands import (
     Signal,
     Stop,
 )
-from gateway.control.control_output import CommandRecord
+from gateway.control.control_output import CommandRecord, frame_of
 from gateway.control.controller import Controller
 from gateway.control.driver import TICK_S, Driver, Event
-from gateway.drivers import BUILT_IN, Family, built_in_platforms
+from gateway.drivers import BUILT_IN, NAMES, Family, built_in_platforms
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages
 from schemas.commands import COMMANDS
@@ -130,10 +130,13 @@ HOSTILE: Final = (
     *(b"null", b'"x"', b"[]", b"{}", b"true", b""),
 )
 """Values that may replace a number in a report of a car, if the report is damaged or from another program."""
-NOISE: Final = b"?\r\n"
+NOISE: Final = b"?\r\nHello\r\n"
 """Bytes that are no report of any car."""
+LOW_SPEED_MAX: Final = 0.3
+"""A `speed_max` below the speed with which a car begins."""
+TOLD_S: Final = 5.0
+"""Time within which readings of a moving car must end the claim that it stands."""
 WRONG_OPTION: Final = "+no_such_option"
-_NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
 _PERSON: Final = Sender("ann@desk", Rank.PERSON)
 
 
@@ -141,7 +144,7 @@ class Bench:
     """A gateway's control with a driver, and a car that sends nothing, or all its `samples` at each tick."""
 
     def __init__(self, family: Family, platform: str, samples: Sequence[bytes] = ()) -> None:
-        self._samples = samples
+        self.samples = samples
         self.control: Controller[Driver] = Controller("red", family.driver_of(platform, {}))
         self.now = 100.0
         self.sent: list[tuple[float, bytes, FrameOrigin]] = []
@@ -162,7 +165,7 @@ class Bench:
             if ticked := self.now >= self._tick_at:
                 self._tick_at = self.now + TICK_S
                 self.control.tick(self.now)
-                said = [event for each in self._samples for event in driver.feed(each, self.now)]
+                said = [event for each in self.samples for event in driver.feed(each, self.now)]
             said += driver.flush(self.now)
             for event in said:
                 driver.on_event(event, self.now)
@@ -385,9 +388,56 @@ def check_motions(family: Family, platform: str) -> Iterator[str]:
     for one, other in OPPOSITES:
         if (1.0, one) in frames and frames[1.0, one] == frames.get((1.0, other)):
             yield f"the frames of {one} and {other} are the same"
+    slowed = Controller("red", family.driver_of(platform, {}), speed_max=LOW_SPEED_MAX).driver
+    if isinstance(slowed, PlainDriver) and slowed.model.speed > LOW_SPEED_MAX:
+        yield f"it begins with {slowed.model.speed:.0%} of full speed, though speed_max is {LOW_SPEED_MAX:.0%}"
     slow, fast = frames.get((SPEED_STEP, Motion.FORWARD)), frames.get((1.0, Motion.FORWARD))
     if "speed" in driver.model.profile.capabilities and slow is not None and slow == fast:
         yield "it has the capability speed, but motion_frame returns the same frame at every self.model.speed"
+
+
+def check_wheels(family: Family, platform: str) -> Iterator[str]:
+    """Check with `wheels_after` of the module, if it has one, what the car does with each frame.
+
+    `wheels_after(data)` returns the shares of full speed, -1..1, that the left and the right wheels have after these
+    bytes, or None if the bytes do not change them. It plays the car, so it must not use the driver's own table.
+    """
+    wheels_after: Callable[[bytes], tuple[float, float] | None] | None = getattr(family, "wheels_after", None)
+    bench = _connected(family, platform, _samples(family))
+    driver = bench.control.driver
+    if wheels_after is None or not isinstance(driver, PlainDriver):
+        return
+    driver.model.speed = speed = 0.5
+    for motion in Motion:
+        wheels = wheels_after(driver.motion_frame(motion))
+        if wheels is None or not _turns(motion, *wheels):
+            yield f"the frame of {motion} turns the wheels by {wheels}"
+        elif max(map(abs, wheels)) > speed + SPEED_STEP / 2:
+            yield f"the frame of {motion} turns the wheels by {wheels}, though model.speed is {speed:g}"
+    for index in range(driver.STOP_FRAMES):
+        wheels = wheels_after(driver.stop_frame(index))
+        if any(wheels or ()) or (wheels is None and index == driver.STOP_FRAMES - 1):
+            yield f"the wheels turn by {wheels} after frame {index} of a stop"
+    able = [what for what in ACTIONS if not isinstance(what, SetMode) and driver.refusal(what) is None]
+    others = [(f"a frame of {what}", frame_of(each)) for what in able for each in driver.frames(what)]
+    others += [("a frame of the set-up", data) for _, data, why in bench.sent if why is FrameOrigin.SETUP]
+    for name, data in dict.fromkeys(others):
+        if any(wheels_after(data) or ()):
+            yield f"{name} drives: {data!r}"
+
+
+def _turns(motion: Motion, left: float, right: float) -> bool:
+    """Return True if the wheels turn so in a motion."""
+    match motion:
+        case Motion.STOP:
+            return left == right == 0
+        case Motion.FORWARD | Motion.BACK:
+            return min(left, right) > 0 if motion is Motion.FORWARD else max(left, right) < 0
+        case Motion.LEFT | Motion.RIGHT:
+            inner, outer = (left, right) if motion is Motion.LEFT else (right, left)
+            return 0 <= inner < outer
+        case _:
+            return left < 0 < right if motion is Motion.SPIN_LEFT else right < 0 < left
 
 
 def check_samples(family: Family, platform: str) -> Iterator[str]:
@@ -437,8 +487,18 @@ def check_rest(family: Family, platform: str) -> Iterator[str]:
     told.run(30.0)
     if told.control.driver.model.basis is Basis.SHOWN:
         yield f"a car that sends {NOISE!r} counts as one that has shown its stop, though that is no report"
+    if isinstance(told.control.driver, PlainDriver) and told.control.driver.model.heard_at is not None:
+        yield f"{NOISE!r} counts as a sign of life, though it is no report: return it as Rejected or TextLine"
     if standing.control.driver.model.basis is Basis.SHOWN and not moving:
         yield "its SAMPLES show a stop: add MOVING, a list of bytes that such a car sends while it moves"
+    if standing.control.driver.model.basis is Basis.SHOWN and moving:
+        standing.samples = moving
+        standing.run(TOLD_S)
+        if standing.control.driver.model.basis is Basis.SHOWN:
+            yield (
+                f"a car that has shown its stop, and then sends MOVING for {TOLD_S:g} s, still counts as standing: set "
+                "model.turned_at in on_reading, or call recover"
+            )
     for sample in moving:
         bench = _connected(family, platform, (sample,))
         bench.ask(Stop())
@@ -464,6 +524,8 @@ def check_stop(family: Family, platform: str) -> Iterator[str]:
         if not any(at <= until_s for at in bench.stop_frames(from_s)):
             limit_s = until_s - asked_at
             yield f"a stop asked for {wait_s:g} s after the link was opened had no frame within {limit_s:g} s"
+        if announced_s == 0:
+            yield f"a stop asked for {wait_s:g} s after the link was opened announces 0 s, so nobody waits for its end"
         last = bench.last(stop)
         if last is None or last.phase not in (Phase.SENT, Phase.FAILED):
             yield f"a stop that no reading shows ends as {last.phase if last else 'nothing'}, not as sent or failed"
@@ -494,7 +556,8 @@ def check_drive(family: Family, platform: str) -> Iterator[str]:
     gaps = [b - a for a, b in pairwise((*during, min(ended, began + lasts_s)))]
     if dead_man_s is not None and (not gaps or max(gaps) > dead_man_s / 2):
         yield f"a held motion is not repeated within half of the car's dead-man time, {dead_man_s:g} s"
-    if during and not stopped:
+    over_at = last.at if last is not None else ended
+    if during and not any(over_at - CHECK_STEP_S <= at <= over_at + FIRST_STOP_S for at in stopped):
         yield "the end of a drive sends no stop"
     if bench.control.driver.model.motors is Motors.ON:
         yield "the motors count as on after the drive"
@@ -511,8 +574,11 @@ def check_actions(family: Family, platform: str) -> Iterator[str]:
             yield f"the refusal of {what} is {_kind(refusal)}, not str or None"
         if refusal is not None and not refusal:
             yield f"{what} is refused without a reason"
-        if refusal is None and not isinstance(what, SetMode | Find) and not driver.frames(what):
-            yield f"{what} is accepted, but has no frames"
+        if refusal is None and not isinstance(what, SetMode):
+            if not driver.frames(what):
+                yield f"{what} is accepted, but has no frames"
+            bench.ask(what)
+            bench.run(1.0)
         if isinstance(what, SetMode) and (refusal is None) != (what.mode in driver.model.profile.modes):
             yield f"{what} is {'accepted' if refusal is None else 'refused'}, contrary to the profile"
 
@@ -597,6 +663,7 @@ CHECKS: Final[tuple[Callable[[Family, str], Iterator[str]], ...]] = (
     check_connect,
     check_answers,
     check_motions,
+    check_wheels,
     check_samples,
     check_hostile,
     check_stop,
@@ -654,8 +721,8 @@ def main(arguments: list[str]) -> int:
     for name in arguments:
         try:
             family: Any = import_module(name)
-            missing = [each for each in _NAMES if not hasattr(family, each)]
-        except Exception as error:  # noqa: BLE001 - a module may raise anything
+            missing = [each for each in NAMES if not hasattr(family, each)]
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - a module may raise anything
             sys.stderr.write(f"gateway.drivers.check: {name} cannot be imported: {type(error).__name__}: {error}\n")
             return 2
         if missing:

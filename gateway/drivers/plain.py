@@ -14,6 +14,7 @@ again every few seconds, because its frames may have been lost.
 """
 
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Mapping
 from typing import ClassVar, Final
 
@@ -61,6 +62,12 @@ RENEWAL_S: Final = 6.0
 the same interval."""
 SPEED_STEP: Final = 0.1
 """One step of the speed, a share of full speed."""
+UNASKED_REPORTS: Final = 3
+UNASKED_S: Final = 0.3
+"""Number of readings in a row with turning wheels, and their time, that count as a motion which nobody here commanded.
+A car that was just stopped may roll for a moment."""
+UNASKED_LOG_S: Final = 30.0
+"""Minimum time between two log records about a motion that nobody commanded. The car is stopped each time."""
 _STEPS: Final[Mapping[SpeedStep, float]] = {SpeedStep.UP: SPEED_STEP, SpeedStep.DOWN: -SPEED_STEP}
 
 
@@ -94,7 +101,8 @@ class PlainModel(Struct):
     range_cm: float | None = None
     range_at: float = float("-inf")
     turned_at: float = float("-inf")
-    """When a reading last showed that the wheels turned. Stays -inf if wheels are not measured."""
+    """When a reading last showed that the wheels turned. Stays -inf if wheels are not measured. The driver of a family
+    sets it. Then a drive is shown, and a car that moves at rest is stopped."""
     sent_motion: Motion = Motion.STOP
     """The motion whose frame was written last."""
     speed: float = 0.5
@@ -199,11 +207,14 @@ class PlainDriver(Driver):
     """Interval at which a held motion is sent again. It must be well under the dead-man time. None: send it once."""
     SILENCE_S: ClassVar[float | None] = None
     """The longest normal silence, or None if every silence is normal."""
+    MOVES_UNASKED: ClassVar[str] = ""
+    """What may drive such a car beside us, and what to do about it, in whole sentences."""
 
     def __init__(self, desk: Desk, profile: CarProfile) -> None:
         super().__init__(desk)
         battery = Battery(desk.battery_policy.of_cells(profile.cells), profile.cells)
         self._model = PlainModel(desk.car, profile, battery, self.SILENCE_S)
+        self._model.speed = min(self._model.speed, desk.speed_max)
         self._stop: PlainStop | None = None
         self._source: PlainStop | HeldMotion | Pending | None = None
         self._part_at = float("-inf")
@@ -214,12 +225,18 @@ class PlainDriver(Driver):
         self._shutting_down = False
         self._ends_at = float("inf")
         self._not_stopped = ""
+        self._unasked_at: deque[float] = deque(maxlen=UNASKED_REPORTS)
+        """Times of the last readings, without a break, that show turning wheels while the car should stand."""
+        self._unasked_log_at = float("-inf")
 
     # ------------------------------------------------------------------ for a family to define
 
     @abstractmethod
     def motion_frame(self, motion: Motion) -> bytes:
-        """Return the frame of a motion at `self.model.speed`. LEFT is a curve, SPIN_LEFT turns on the spot."""
+        """Return the frame of a motion at `self.model.speed`, which `speed_max` of the fleet file limits.
+
+        LEFT is a curve, SPIN_LEFT turns on the spot.
+        """
 
     def stop_frame(self, index: int) -> bytes:
         """Return the frame number `index` of a stop, from 0. The last one is also sent alone, to repeat the stop."""
@@ -228,7 +245,10 @@ class PlainDriver(Driver):
 
     @abstractmethod
     def part_frames(self, what: Action) -> tuple[bytes | Later, ...] | None:
-        """Return the frames of an action on a part of the car; `Later` delays one. None if the car cannot do it."""
+        """Return the frames of an action on a part of the car; `Later` delays one. None if the car cannot do it.
+
+        `Find` is such an action, too: some lights or sounds that show which car it is.
+        """
 
     @property
     def can_show(self) -> bool:
@@ -285,6 +305,23 @@ class PlainDriver(Driver):
             self._log.log(Level.INFO, "answers_again", words, now)
             self._begin_again(words, TrustEvent.HEARD, now)
         self.on_reading(event, now)
+        if not (model.at_rest and model.turned_at >= event.at):
+            self._unasked_at.clear()
+            return
+        self._unasked_at.append(event.at)
+        if len(self._unasked_at) == UNASKED_REPORTS and event.at >= self._unasked_at[0] + UNASKED_S:
+            told = (f"{model.name} moves, and nobody here drives it.", self.MOVES_UNASKED, "The gateway stops it.")
+            words = " ".join(filter(None, told))
+            if self.may_log_unasked(now):
+                self._log.log(Level.WARNING, "moves_unasked", words, now)
+            self.recover(words, now)
+
+    def may_log_unasked(self, now: float) -> bool:
+        """Return True if a motion that nobody commanded, or its cause, was not logged a short time ago."""
+        if now < self._unasked_log_at + UNASKED_LOG_S:
+            return False
+        self._unasked_log_at = now
+        return True
 
     # ------------------------------------------------------------------ the link, and time
 
@@ -315,7 +352,8 @@ class PlainDriver(Driver):
     def _when_cut(self) -> str:
         dead_man_s = self._model.profile.dead_man_s
         if dead_man_s is None:
-            return "Look at the car. The gateway stops it as soon as the link is back."
+            later = "" if self._shutting_down else " The gateway stops it as soon as the link is back."
+            return f"Look at the car.{later}"
         return f"Its dead-man stops it within {dead_man_s:g} s, unless something else drives it. Look at the car."
 
     def tick(self, now: float) -> None:
@@ -493,9 +531,7 @@ class PlainDriver(Driver):
                     maximum = self.desk.speed_max
                     return f"{car} would drive at {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
                 return None
-            case Find():
-                return None
-            case PartAction() if self.part_frames(what) is None:
+            case PartAction() | Find() if not self.part_frames(what):
                 has = ", ".join(sorted(model.profile.capabilities))
                 return f"{car} ({model.profile.name}) cannot do that. It has: {has}."
             case _:
@@ -510,7 +546,7 @@ class PlainDriver(Driver):
     def _apply(self, what: Action, now: float) -> None:
         """Record the effect of a written action. Send the held motion again at once with a new speed."""
         if isinstance(what, ChangeSpeed):
-            self._model.speed = min(1.0, max(SPEED_STEP, self._model.speed + _STEPS[what.step]))
+            self._model.speed = min(self.desk.speed_max, max(SPEED_STEP, self._model.speed + _STEPS[what.step]))
             self._resend_at = now
 
     def accepts_commands(self, now: float) -> bool:
@@ -592,6 +628,8 @@ class PlainDriver(Driver):
 
     def show_rest(self, words: str, now: float) -> None:
         """End the running stop, because the readings have shown that the car stands still."""
+        if self._model.shows is not Shows.YES:
+            self._model.shows, self._model.shows_words = Shows.YES, f"{self._model.name} has shown a stop: {words}"
         if self._stop is not None and self._stop.last_at > float("-inf"):
             self._finish(self._stop, Basis.SHOWN, words, now)
         elif self._model.at_rest and not self._model.trust.shown:
@@ -623,10 +661,10 @@ class PlainDriver(Driver):
 
     def worst_s(self, now: float) -> float:
         """Return the longest time until the motors are off, s, if a stop is requested now and its frames arrive."""
+        del now
         stop = self._stop
-        if stop is not None and stop.last_at > float("-inf"):
-            return max(0.0, self._gives_way_at(stop) - now)
-        return self._length_s(stop.index if stop is not None else 0) + self.STOPS_WITHIN_S
+        goes_on = stop is not None and stop.last_at == float("-inf")  # a stop whose frames are all written is repeated
+        return self._length_s(stop.index if stop is not None and goes_on else 0) + self.STOPS_WITHIN_S
 
     def shut_down(self, now: float) -> None:
         """Stop the car for the last time."""

@@ -47,7 +47,7 @@ from gateway.control.commands import Action, Drive, Find, SetLight
 from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine
 from gateway.drivers.lines import LineSplitter
-from gateway.drivers.plain import PlainDriver
+from gateway.drivers.plain import UNASKED_LOG_S, PlainDriver
 from gateway.drivers.plain_profile import PlainProfile
 from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis, UgvFirmware
 from gateway.drivers.waveshare.feedback import Feedback, read_line
@@ -93,10 +93,6 @@ STANDS_REPORTS: Final = 3
 """Time, and number of feedbacks, for which the wheels must stand still to show a stop: two turns of the speed loop."""
 TURNS_M_S: Final = 0.02
 """Minimum speed of a wheel that counts as turning: two encoder pulses per turn of the firmware's loop (some 10 ms)."""
-UNASKED_REPORTS: Final = 3
-"""Number of feedbacks in a row with turning wheels that count as a motion which nobody here commanded."""
-UNASKED_LOG_S: Final = 30.0
-"""Minimum time between two log records about a motion that nobody commanded. The car is stopped each time."""
 ON_ITS_WAY_S: Final = 2.0
 """Maximum time that a line of ours takes to reach the car over a slow link."""
 STUCK_S: Final = 1.0
@@ -150,6 +146,9 @@ class WaveshareDriver(PlainDriver):
     EVIDENCE_S: ClassVar[float] = 4.0
     RESEND_S: ClassVar[float | None] = 0.25
     SILENCE_S: ClassVar[float | None] = 1.5
+    MOVES_UNASKED: ClassVar[str] = (
+        "Its own web page, a radio remote or a mission may do so: close the page, and change the password of its Wi-Fi."
+    )
 
     def __init__(self, desk: Desk, profile: PlainProfile) -> None:
         super().__init__(desk, profile)
@@ -160,8 +159,6 @@ class WaveshareDriver(PlainDriver):
         """Number of the last frame of a stop. It is in the frame, so that its echo can be recognized."""
         self._moved_at = float("-inf")
         """When the last motion was written."""
-        self._named_at = float("-inf")
-        """When a motion that nobody here commanded, or another program, was last logged."""
         self._answered_at = float("-inf")
         self._forget_car(float("-inf"))
 
@@ -193,7 +190,7 @@ class WaveshareDriver(PlainDriver):
         self._wanted: set[bytes] = set()
         """The last line of each try of this stop, until the car has repeated one of them."""
         self._stands_since: float | None = None
-        self._stands = self._unasked = 0
+        self._stands = 0
         self._stuck_since: float | None = None
         self._odometer_m: tuple[float, float] | None = None
         self._voltage: tuple[float, float] = (0.0, float("-inf"))
@@ -287,8 +284,7 @@ class WaveshareDriver(PlainDriver):
         """Log that another program talks to the car, if the car answers a query that was not ours."""
         if self._setup is Setup.READY and not _OWN.match(event.raw):
             again, self._answered_at = now < self._answered_at + UNASKED_LOG_S, now
-            if again and now >= self._named_at + UNASKED_LOG_S:
-                self._named_at = now
+            if again and self.may_log_unasked(now):
                 words = f"another program talks to {self._model.name}, and can drive it: is its own web page open?"
                 self._log.log(Level.WARNING, "other_program", words, now)
 
@@ -366,7 +362,7 @@ class WaveshareDriver(PlainDriver):
             self._setup_at = now
 
     def _on_wheels(self, event: Feedback, now: float) -> None:
-        """Use measured wheel speeds as evidence of a stop, of working encoders, or of a motion that is not ours."""
+        """Use measured wheel speeds as evidence of a motion, of a stop, or of working encoders."""
         model = self._model
         turning = [abs(speed) >= TURNS_M_S for speed in (event.left_m_s, event.right_m_s)]
         model.turned_at = event.at if any(turning) else model.turned_at
@@ -385,17 +381,6 @@ class WaveshareDriver(PlainDriver):
                 self.show_rest(f"its wheels stood still in {self._stands} feedbacks since it repeated the stop", now)
         elif not stands and self._stands_since is not None:
             self._stands, self._stands_since = 0, event.at
-        self._unasked = self._unasked + 1 if any(turning) and model.at_rest else 0
-        if self._unasked >= UNASKED_REPORTS:
-            self._unasked = 0
-            words = (
-                f"{model.name} moves, and nobody here drives it. Its own web page, a radio remote or a mission may do "
-                "so: close the page, and change the password of its Wi-Fi. The gateway stops it."
-            )
-            if now >= self._named_at + UNASKED_LOG_S:
-                self._named_at = now
-                self._log.log(Level.WARNING, "moves_unasked", words, now)
-            self.recover(words, now)
 
     def _check_stuck(self, turning: list[bool], now: float) -> None:
         """End a drive in which a wheel stands still, because the speed control adds power until the wheel turns."""
@@ -507,7 +492,7 @@ class WaveshareDriver(PlainDriver):
 
     def motion_frame(self, motion: Motion) -> bytes:
         """Return the line of a motion. No number in it exceeds FULL_SPEED."""
-        speed = min(FULL_SPEED, max(0.0, FULL_SPEED * min(self._model.speed, self.desk.speed_max)))
+        speed = min(FULL_SPEED, max(0.0, FULL_SPEED * self._model.speed))
         left, right = (round(speed * share, 3) for share in _SIDES[motion])
         return line(DRIVE, L=left, R=right)
 

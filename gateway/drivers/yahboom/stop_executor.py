@@ -133,9 +133,9 @@ class StopExecutor:
         """Fail the commands of the running stop, because the link is down."""
         self.renewal.suspend()
         running, self.running = self.running, None
+        later = "" if self.shutting_down else " The gateway stops it as soon as the link is back."
         words = (
-            f"NOT CONFIRMED: {self.model.name} became unreachable during the stop ({reason}). Look at the car. "
-            "The gateway stops it as soon as the link is back."
+            f"NOT CONFIRMED: {self.model.name} became unreachable during the stop ({reason}). Look at the car.{later}"
         )
         for pending in running.commands if running else ():
             self._log.record(pending, Phase.FAILED, now, reason=cause, words=words)

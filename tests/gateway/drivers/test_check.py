@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 from msgspec.structs import replace
 
+from gateway.control.commands import Action, Find
 from gateway.control.driver import Desk, Event
 from gateway.drivers import Family, check
 from gateway.drivers.plain_profile import PlainProfile
@@ -278,13 +279,97 @@ class RestsAlways(tank.TankDriver):
         self.show_rest("it reports", now)
 
 
+class SwapsSpins(tank.TankDriver):
+    """Spins to the wrong side."""
+
+    def motion_frame(self, motion: Motion) -> bytes:
+        swapped = {Motion.SPIN_LEFT: Motion.SPIN_RIGHT, Motion.SPIN_RIGHT: Motion.SPIN_LEFT}
+        return super().motion_frame(swapped.get(motion, motion))
+
+
+class TooFast(tank.TankDriver):
+    """Drives at twice the speed."""
+
+    def motion_frame(self, motion: Motion) -> bytes:
+        before, self.model.speed = self.model.speed, 2 * self.model.speed
+        frame = super().motion_frame(motion)
+        self.model.speed = before
+        return frame
+
+
+class StopsLate(tank.TankDriver):
+    """Drives with the first frame of a stop."""
+
+    def stop_frame(self, index: int) -> bytes:
+        return b'{"move":[0.1,0.1]}\n' if index == 0 else super().stop_frame(index)
+
+
+class ShinesAhead(tank.TankDriver):
+    """Drives when it shows which car it is."""
+
+    def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
+        return (b'{"move":[0.1,0.1]}\n',) if isinstance(what, Find) else None
+
+
+class Hides(tank.TankDriver):
+    """Accepts to show which car it is, and has no frames for that."""
+
+    def refusal(self, what: Action) -> str | None:
+        return None if isinstance(what, Find) else super().refusal(what)
+
+
+class Coasts(tank.TankDriver):
+    """Writes nothing at the end of a drive."""
+
+    def end_motion(self, now: float, pending: Any = None) -> None:
+        del now, pending
+
+
+class Hurries(tank.TankDriver):
+    """Begins at half of its speed, whatever the fleet file says."""
+
+    def __init__(self, desk: Desk) -> None:
+        super().__init__(desk)
+        self.model.speed = 0.5
+
+
+class Trusts(tank.TankDriver):
+    """Takes a report of no distance for one of a car that stands, and never doubts it."""
+
+    @property
+    def can_show(self) -> bool:
+        return True
+
+    def on_reading(self, event: Event, now: float) -> None:
+        if cast("tank.TankReport", event).dist_cm < 100:
+            self.show_rest("it is near", now)
+
+
+class Doubts(Trusts):
+    """Takes a report of a great distance for one of a car that moves."""
+
+    def on_reading(self, event: Event, now: float) -> None:
+        super().on_reading(event, now)
+        if cast("tank.TankReport", event).dist_cm > 100:
+            self.model.turned_at = event.at
+
+
 @pytest.mark.parametrize(
     ("driver", "fails"),
     [
         (Beats, set()),
-        (Types, {"check_connect", "check_drive", "check_bytes", "check_motions"}),
+        (Doubts, set()),
+        (Trusts, {"check_rest"}),
+        (SwapsSpins, {"check_wheels"}),
+        (TooFast, {"check_wheels"}),
+        (StopsLate, {"check_wheels"}),
+        (ShinesAhead, {"check_wheels"}),
+        (Hides, {"check_actions"}),
+        (Coasts, {"check_drive"}),
+        (Hurries, {"check_motions"}),
+        (Types, {"check_connect", "check_drive", "check_bytes", "check_motions", "check_actions", "check_wheels"}),
         (Texts, {"check_samples", "check_hostile"}),
-        (AnyNumber, {"check_hostile", "check_bytes"}),
+        (AnyNumber, {"check_hostile", "check_bytes", "check_rest"}),
         (Drops, {"check_loss"}),
         (Keeps, {"check_loss"}),
         (Unsaved, {"check_kept"}),
@@ -299,16 +384,16 @@ class RestsAlways(tank.TankDriver):
         (BeatsOnly, {"check_drive"}),
         (BeatsAsleep, {"check_connect", "check_drive"}),
         (Never, {"check_connect", "check_motions", "check_stop", "check_drive", "check_loss", "check_end"}),
-        (OneSpeed, {"check_motions"}),
-        (Turned, {"check_motions"}),
+        (OneSpeed, {"check_motions", "check_wheels"}),
+        (Turned, {"check_motions", "check_wheels"}),
         (Promises, {"check_capabilities"}),
         (Waits, {"check_drive"}),
         (Fails, {"check_bytes", "check_samples", "check_hostile", "check_loss"}),
         (Talks, {"check_connect", "check_stop", "check_end", "check_rest"}),
         (Mute, {"check_connect", "check_stop", "check_loss", "check_end", "check_bytes", "check_drive"}),
         (Splits, {"check_bytes", "check_samples"}),
-        (Empty, {"check_connect", "check_motions", "check_drive"}),
-        (Lacks, {"check_motions"}),
+        (Empty, {"check_connect", "check_motions", "check_drive", "check_wheels"}),
+        (Lacks, {"check_motions", "check_wheels"}),
         (Misnames, {"check_samples", "check_hostile"}),
         (OnlySays, {"check_drive"}),
     ],
@@ -317,6 +402,8 @@ def test_careless_driver_fails_driver_check(driver: Any, fails: set[str]) -> Non
     family = SimpleNamespace(
         PLATFORMS=("tank",),
         SAMPLES=tank.SAMPLES,
+        MOVING=(b'{"v":7.9,"dist_cm":200}\n',),
+        wheels_after=tank.wheels_after,
         profile_of=lambda name: replace(
             tank.profile_of(name), dead_man_s=5.0 if driver in (OnlySays, BeatsOnly) else None
         ),

@@ -1,15 +1,18 @@
 """The plain engine, with the tank: what waits, repeats, gives way and ends."""
 
 import json
+from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
-from gateway.control.commands import ChangeSpeed, Drive, Stop
+from gateway.control.commands import ChangeSpeed, Drive, Find, Stop
+from gateway.control.controller import Controller
+from gateway.control.driver import Driver, Event
 from gateway.drivers import Family
 from gateway.drivers.check import Bench
 from gateway.drivers.plain import RENEWAL_S
-from schemas.words import Basis, CarTrust, FrameOrigin, Motion, Motors, Phase, SpeedStep
+from schemas.words import Basis, CarTrust, FrameOrigin, Motion, Motors, Phase, Reason, Shows, SpeedStep
 from tests.support import tank
 
 REPORT = b'{"v":7.9,"dist_cm":42}\n'
@@ -18,8 +21,9 @@ REPORT = b'{"v":7.9,"dist_cm":42}\n'
 class TankBench(Bench):
     """A tank that reports."""
 
-    def __init__(self) -> None:
+    def __init__(self, speed_max: float = 1.0) -> None:
         super().__init__(cast("Family", tank), "tank")
+        self.control = Controller("red", tank.driver_of("tank", {}), speed_max=speed_max)
         self.reports = True
 
     def run(self, seconds: float) -> None:
@@ -91,6 +95,73 @@ def test_change_of_speed_behind_a_stop_drives_nothing(bench: TankBench) -> None:
     assert last is not None
     assert last.phase is Phase.SENT, "the part of the car does not end the stop"
     assert bench.control.driver.model.at_rest
+
+
+def test_stop_of_silent_car_announces_time_and_fails(bench: TankBench) -> None:
+    """The client takes a stop without a worst case for one of a car at rest: `fleet stop` said that it was sent."""
+    bench.ask(Drive(Motion.FORWARD, 30.0))
+    bench.run(0.4)
+    bench.reports = False
+    bench.run(3.0)
+    stop = bench.ask(Stop())
+    (queued,) = [each for each in bench.records if each.command.id == stop and each.phase is Phase.QUEUED]
+    assert queued.worst_case_s > 0
+    bench.run(10.0)
+    last = bench.last(stop)
+    assert last is not None
+    assert last.phase is Phase.FAILED
+
+
+@pytest.mark.parametrize("speed_max", [0.05, 0.3, 1.0])
+def test_speed_max_limits_speed_from_start(speed_max: float) -> None:
+    driver = Controller[Driver]("red", tank.driver_of("tank", {}), speed_max=speed_max).driver
+    assert driver.model.outputs.speed == min(0.5, speed_max)
+    for step in (SpeedStep.UP, SpeedStep.DOWN):
+        bench = TankBench(speed_max)
+        bench.control.link_up(bench.now)
+        bench.run(1.0)
+        for _ in range(7):
+            bench.ask(ChangeSpeed(step))
+            bench.run(0.6)
+        bench.ask(Drive(Motion.FORWARD, 0.4))
+        assert 0 < bench.moves()[-1][0] <= speed_max
+
+
+def test_action_without_frames_is_refused(bench: TankBench) -> None:
+    find = bench.ask(Find())
+    bench.run(1.0)
+    last = bench.last(find)
+    assert last is not None
+    assert (last.phase, last.reason) == (Phase.REJECTED, Reason.UNSUPPORTED)
+
+
+class Rolls(tank.TankDriver):
+    """Takes a great distance for turning wheels, and a small one for standing ones."""
+
+    MOVES_UNASKED = "Close its page."
+
+    @property
+    def can_show(self) -> bool:
+        return True
+
+    def on_reading(self, event: Event, now: float) -> None:
+        if cast("tank.TankReport", event).dist_cm > 100:
+            self.model.turned_at = event.at
+        else:
+            self.show_rest("it is near", now)
+
+
+def test_car_that_moves_unasked_is_stopped_and_named() -> None:
+    bench = Bench(cast("Family", SimpleNamespace(driver_of=lambda name, kept: Rolls)), "tank", tank.SAMPLES)
+    bench.control.link_up(bench.now)
+    bench.run(2.0)
+    model = bench.control.driver.model
+    assert (model.trust.state, model.basis, model.shows_stops[0]) == (CarTrust.STOPPED, Basis.SHOWN, Shows.YES)
+    before = len(bench.sent)
+    bench.samples = (b'{"v":7.9,"dist_cm":200}\n',)
+    bench.run(2.0)
+    assert (model.motors, model.basis) != (Motors.OFF, Basis.SHOWN)
+    assert bench.stop_frames(bench.sent[before][0])
 
 
 def test_silent_car_is_stopped_again_and_again(bench: TankBench) -> None:

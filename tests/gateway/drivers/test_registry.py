@@ -1,5 +1,6 @@
 """A platform finds its family: ours by a table, others by the entry point of their package."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,16 @@ def test_all_profiles_include_installed_families(tmp_path: Path, monkeypatch: py
     with installed_driver(tmp_path / "again", monkeypatch, "tests.support.tank"):
         assert drivers.all_profiles() == drivers.built_in_profiles()
         assert has_parts(drivers.broken["tank"], "profiles() … KeyError")
+
+
+@pytest.mark.parametrize("text", ["import sys; sys.exit(3)", "PLATFORMS = ('tank',)"], ids=["ends", "lacks"])
+def test_package_that_is_no_driver_is_named(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "no_driver.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "no_driver", raising=False)
+    with installed_driver(tmp_path, monkeypatch, "no_driver"):
+        assert drivers.platforms() == drivers.built_in_platforms()
+        assert "no_driver" in drivers.broken["tank"]
 
 
 def test_package_that_fails_is_named_and_others_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
