@@ -18,7 +18,7 @@ from fleet.client.commands import (
     stop_request,
 )
 from fleet.client.lost_hub import LostHub
-from fleet.client.outcome import Outcome, bus_lost_words
+from fleet.client.outcome import NO_ANSWER, Outcome, bus_lost_words
 from fleet.commands.fleets import client_in, in_all_fleets
 from fleet.commands.options import (
     bus_options,
@@ -29,9 +29,19 @@ from fleet.commands.options import (
     take_option,
     with_client,
 )
-from fleet.commands.params import ALL_CARS, Choice, Duration, any_cars_argument, cars_argument, resolve_cars
+from fleet.commands.params import (
+    ALL_CARS,
+    Choice,
+    Duration,
+    any_cars_argument,
+    cars_argument,
+    resolve_cars,
+    stopped_cars_argument,
+)
+from schemas import keys
 from schemas.bus import BusError, HubUnreachable, NoFleet
 from schemas.process import signals, startup
+from schemas.process.stdio import printable
 from schemas.words import Mode, Motion, Scope
 
 _MOTIONS: Final = tuple(each for each in Motion if each is not Motion.STOP)
@@ -85,7 +95,7 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 
 
 @click.command(epilog="\b\nexamples:\n  fleet stop\n  fleet stop red blue")
-@any_cars_argument
+@stopped_cars_argument
 @json_option
 @bus_options
 def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: bool) -> None:
@@ -98,7 +108,7 @@ def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: boo
 
 
 @click.command(epilog="\b\nexamples:\n  fleet estop\n  fleet estop red --why 'someone is on the track'")
-@any_cars_argument
+@stopped_cars_argument
 @click.option("--why", default="", metavar="WORDS", help="Record what happened.")
 @json_option
 @bus_options
@@ -137,15 +147,40 @@ def _stop(
     *,
     as_json: bool,
 ) -> Never:
-    """Stop the cars in every fleet that the command could mean. `request_for` makes the request for the named cars."""
+    """Stop the cars in every fleet that the command could mean. `request_for` makes the request for the named cars.
+
+    A word that names no car fails, and the other cars are stopped all the same.
+    """
+    words = tuple(each for each in cars if keys.is_name(each.removeprefix("@")))
+    wrong = [_not_stopped(each, f"use {keys.NAME_RULE}") for each in cars if each not in words]
+    if wrong and not words:  # without a word, all cars would be meant
+        raise click.UsageError("; ".join(map(str, wrong)))
 
     def act(there: Fleet) -> list[Outcome]:
-        named = _named(there, cars)
-        request = request_for(named)
-        return [*there.ask(request, named), *_ask_missing_cars(there, request, cars)]
+        if not words or ALL_CARS in words:
+            request = request_for(None)
+            return [*there.ask(request), *_ask_missing_cars(there, request, words)]
+        named, failed = _cars_to_stop(there, words)
+        return [*(there.ask(request_for(named), named) if named else ()), *failed]
 
     with _client_that_stops(connect, fleet) as client:
-        end_with(client, in_all_fleets(client, connect, cars, act), as_json=as_json)
+        end_with(client, [*in_all_fleets(client, connect, words, act), *wrong], as_json=as_json)
+
+
+def _cars_to_stop(client: Fleet, words: Sequence[str]) -> tuple[list[str], list[Outcome]]:
+    """Return the cars that these words name, and an outcome for each word that names none."""
+    named: dict[str, None] = {}
+    failed = []
+    for each in words:
+        try:
+            named.update(dict.fromkeys(resolve_cars(client, [each])))
+        except click.ClickException as error:
+            failed.append(_not_stopped(each, error.message))
+    return list(named), failed
+
+
+def _not_stopped(word: str, why: str) -> Outcome:
+    return Outcome(printable(word), ok=False, phase=NO_ANSWER, words=f"{NOT_STOPPED}: {why}")
 
 
 @click.command(

@@ -149,6 +149,17 @@ class CarNames(click.ParamType[tuple[str, ...]]):
         return found
 
 
+class NamesToStop(CarNames):
+    """Cars to stop. A wrong name must not keep the others from being stopped, so it is returned as it was typed."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:  # noqa: ARG002 - click's signature
+        """Return the names. Names are lower case, and a stop of `RED` means red."""
+        if isinstance(value, tuple):
+            return value
+        names = (each.strip() for each in str(value).split(","))
+        return tuple(each.lower() if keys.is_name(each.lower().removeprefix("@")) else each for each in names if each)
+
+
 def complete_cars(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
     """Return connected cars for the shell, also after a comma, and groups. It never fails, prints, or takes long."""
     earlier, comma, begin = incomplete.rpartition(",")
@@ -254,6 +265,7 @@ def _place(ctx: click.Context, _: click.Parameter, value: Path | None) -> None:
 
 cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="CAR...", callback=_require_cars)
 any_cars_argument = click.argument("cars", type=CarNames(), nargs=-1, metavar="[CAR...]", callback=_flat)
+stopped_cars_argument = click.argument("cars", type=NamesToStop(), nargs=-1, metavar="[CAR...]", callback=_flat)
 car_option = click.option(
     "--car", "cars", type=CarNames(), multiple=True, metavar="CAR[,CAR...]", callback=_flat, help="Use only these cars."
 )
@@ -292,8 +304,10 @@ def _members(client: Fleet, group: str) -> Sequence[str]:
     """Return the cars of a group, from the running fleet, or else from the fleet file here. Raises click's errors."""
     status = ask_status(client.bus, client.name)
     groups = _groups_of_status(status) if status else _groups_of_file()
-    if group in groups:
+    if groups.get(group):
         return groups[group]
+    if group in groups:
+        raise click.ClickException(f'The group "@{group}" has no cars.')
     if groups:
         near = did_you_mean(group, groups).replace("mean ", "mean @")
         hint = near or f"Groups: @{', @'.join(sorted(groups))}."

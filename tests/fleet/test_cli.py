@@ -19,6 +19,7 @@ from click.testing import CliRunner, Result
 
 from fleet import cli
 from fleet.client.hints import complete_hints
+from fleet.client.outcome import NO_ANSWER
 from fleet.commands.observe import CAR_COLUMNS
 from tests.fleet.conftest import Cars, running
 from tests.support.message_length import too_long
@@ -114,7 +115,8 @@ def lines(done: "subprocess.CompletedProcess[str]") -> list[Any]:
         ("led red", ": fleet led CAR... COLOR, … : fleet led red '#ff0010'"),
         ("speed red faster", '"faster" … speed step. … : up, down.'),
         ("fan", ": fleet fan CAR... [on|off], … : fleet fan red"),
-        ("stop Red", 'No car "Red". … lower case'),
+        ("fan Red", 'No car "Red". … lower case'),
+        ("stop !", "!: NOT STOPPED: use 1 to 32 of"),
         ("estop --why", "'--why' … (see fleet estop --help)"),
         ("get red -n 0", "--last: 0 … 1."),
         ("up --sim x", '--sim: "x" … whole number.'),
@@ -420,6 +422,23 @@ def test_wrong_name_beside_all_is_named_and_all_are_stopped(cars: Cars) -> None:
     assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["blue", "green", "red"]
     assert done.stderr.startswith("gren: NOT STOPPED: ")
     assert " mean green?" in done.stderr
+    assert run(cars.endpoint, "resume").returncode == 0
+
+
+def test_wrong_word_of_a_stop_is_named_and_all_others_are_stopped(cars: Cars) -> None:
+    done = run(cars.endpoint, "stop", "BLUE,,!", "@nobody", "red", "--json")
+    said = {each["car"]: each for each in map(json.loads, done.stdout.splitlines())}
+    assert done.returncode == 1
+    assert {car: each["phase"] != NO_ANSWER for car, each in said.items()} == {
+        "blue": True,
+        "red": True,
+        "@nobody": False,
+        "!": False,
+    }
+    assert said["@nobody"]["words"].startswith("NOT STOPPED: ")
+    nobody = run(cars.endpoint, "stop", "@nobody")
+    assert (nobody.returncode, nobody.stdout) == (1, "")
+    assert nobody.stderr.startswith("@nobody: NOT STOPPED: "), "and no other car is stopped"
     assert run(cars.endpoint, "resume").returncode == 0
 
 

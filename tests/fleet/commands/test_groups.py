@@ -90,6 +90,9 @@ def test_wrong_key_or_fleet_names_the_likely_one(client: Fleet) -> None:
     assert error("watch", "*/sensor/rang") == "No key */sensor/rang. Did you mean */sensor/range?"
     assert "not a group" in error("get", "@a")
     assert error("list", "@A").endswith(' mean "@a"?')
+    Path("fleet.yaml").write_text(FILE.replace("blue, green]", "]", 1), encoding="utf-8")
+    assert error("led", "@lab", "blue") == 'The group "@lab" has no cars.'
+    Path("fleet.yaml").unlink()
     for command in ("list", "stop", "pause"):
         assert re.fullmatch(r'No fleet "flet" .*: fleet\.', error(command, "--fleet", "flet"))
     named = CliRunner().invoke(cli, ["stop", "red", "--fleet", "flet", "--connect", client.bus.endpoint])
