@@ -137,7 +137,9 @@ class LimitsEntry(Entry):
     longest_drive_s: float = Field(
         default=DEFAULT_MAX_DRIVE_S, gt=0, le=3600, description="longest duration of one drive command, seconds"
     )
-    speed_max: float = Field(default=1.0, gt=0, le=1, description="highest speed, as a share of the car's top speed")
+    speed_max: float = Field(
+        default=1.0, gt=0, le=1, description="highest speed of drives, as a share of the car's top speed"
+    )
     battery_low_v: _Volts = Field(
         default=LOW_V,
         description="the battery is low below this voltage with the motors off, volts; with three cells, 1.5 "

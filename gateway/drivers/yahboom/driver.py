@@ -155,8 +155,10 @@ class YahboomDriver(Executor):
                 if words is None and isinstance(what, Fan) and what.on is not None and is_unknown:
                     return f"{car}'s fan state is unknown, so on/off is not possible. Toggle it: `fleet fan {car}`."
                 return words
+            case Drive(Motion.STOP):
+                return None
             case Drive(motion):
-                return profile.refusal(General(motion))
+                return profile.refusal(General(motion)) or self._already_too_fast()
             case _:
                 return None
 
@@ -169,6 +171,15 @@ class YahboomDriver(Executor):
             return None
         car = self.desk.car
         return f"{car} would drive at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
+
+    def _already_too_fast(self) -> str | None:
+        """Return why the car may not be driven at its present speed, or None. Cars begin at a speed of their own."""
+        speed, maximum, car = self.model.profile.speed, self.desk.speed_max, self.desk.car
+        share, slowest = speed.fraction(self.model.believed.speed), speed.fraction(speed.low)
+        if share <= maximum:
+            return None
+        advice = f"`fleet speed {car} down` lowers it." if slowest <= maximum else f"Its slowest is {slowest:.0%}."
+        return f"{car} drives at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max). {advice}"
 
     def frames(self, what: Action) -> tuple[Frame | Later, ...]:
         """Return the frames of an action on a part of the car. Leave out those that the car does not understand."""

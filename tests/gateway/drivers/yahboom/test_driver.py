@@ -2,9 +2,9 @@
 
 import pytest
 
-from gateway.control.commands import ChangeSpeed
+from gateway.control.commands import ChangeSpeed, Drive
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from schemas.words import SpeedStep
+from schemas.words import Motion, SpeedStep
 from tests.support.controls import control
 
 
@@ -27,3 +27,24 @@ def test_no_step_beyond_the_speed_that_is_allowed(
     words = driver.refusal(ChangeSpeed(step))
     assert (words is not None) is refused
     assert words is None or f"{limit:.0%}" in words
+
+
+@pytest.mark.parametrize(
+    ("platform", "limit", "steps_down"),
+    [("arduino", 0.59, 0), ("arduino", 0.5, 1), ("arduino", 0.2, 2), ("stm32", 0.2, 0), ("raspberry_pi", 0.3, 1)],
+)
+def test_no_drive_beyond_the_speed_that_is_allowed(platform: str, limit: float, steps_down: int) -> None:
+    driver = control(parse_platform(platform), speed_max=limit).driver
+    for _ in range(steps_down):
+        words = driver.refusal(Drive(Motion.FORWARD))
+        assert words is not None
+        assert f"{limit:.0%}" in words
+        assert driver.refusal(ChangeSpeed(SpeedStep.DOWN)) is None
+        driver.model.believed.speed = driver.model.profile.speed.step(driver.model.believed.speed, SpeedStep.DOWN)
+    assert driver.refusal(Drive(Motion.FORWARD)) is None
+
+
+def test_stop_is_never_too_fast() -> None:
+    driver = control(parse_platform("arduino"), speed_max=0.1).driver
+    assert driver.refusal(Drive(Motion.FORWARD)) is not None
+    assert driver.refusal(Drive(Motion.STOP)) is None
