@@ -1,5 +1,6 @@
 """`fleet drive, mode, stop, estop, resume`: the commands that move cars or stop them."""
 
+import time
 from collections.abc import Callable, Sequence
 from typing import Final, Never
 
@@ -10,6 +11,7 @@ from fleet.client.claims import NOT_STOPPED
 from fleet.client.client import Fleet
 from fleet.client.commands import (
     MAX_DRIVE_S,
+    STOP_TTL_S,
     CommandRequest,
     drive_request,
     estop_request,
@@ -44,6 +46,11 @@ from schemas.process import signals, startup
 from schemas.process.stdio import printable
 from schemas.words import Mode, Motion, Scope
 
+HANG_S: Final = 1.0
+"""A bus that takes longer than this to answer a client hangs, and may come back."""
+REJOIN_S: Final = 3.0
+REJOIN_POLL_S: Final = 0.05
+"""Time within which gateways come back to a bus that hung: they try twice a second. How often we look for them."""
 _MOTIONS: Final = tuple(each for each in Motion if each is not Motion.STOP)
 
 
@@ -127,16 +134,24 @@ def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, a
     )
 
 
-def _client_that_stops(connect: str | None, fleet: str) -> Fleet:
-    """Open the client. If that fails, say first that nothing was stopped."""
-    try:
-        return client_in(connect, fleet)
-    except (LostHub, HubUnreachable) as error:
-        raise BusError(f"{NOT_STOPPED}: this command stopped nothing. {error}") from None
-    except NoFleet:  # nothing is running, which is not a fault
-        raise
-    except BusError as error:
-        raise BusError(f"{bus_lost_words('a car')} ({error})") from None
+def _client_that_stops(connect: str | None, fleet: str) -> tuple[Fleet, bool]:
+    """Return the client, and True if the hub hung before. If it fails, say first that nothing was stopped.
+
+    A hub that hangs has as long as a stop whose bus is lost.
+    """
+    first_at = time.monotonic()
+    while True:
+        began = time.monotonic()
+        try:
+            return client_in(connect, fleet), time.monotonic() > first_at + HANG_S
+        except (LostHub, HubUnreachable) as error:
+            raise BusError(f"{NOT_STOPPED}: this command stopped nothing. {error}") from None
+        except NoFleet:  # nothing is running, which is not a fault
+            raise
+        except BusError as error:
+            if not began + HANG_S < time.monotonic() < first_at + STOP_TTL_S:
+                raise BusError(f"{bus_lost_words('a car')} ({error})") from None
+            click.echo("fleet: the fleet's bus does not answer yet: trying again", err=True)
 
 
 def _stop(
@@ -157,14 +172,33 @@ def _stop(
         raise click.UsageError("; ".join(map(str, wrong)))
 
     def act(there: Fleet) -> list[Outcome]:
+        ask = _ask_returning if hung else Fleet.ask
         if not words or ALL_CARS in words:
             request = request_for(None)
-            return [*there.ask(request), *_ask_missing_cars(there, request, words)]
+            return [*ask(there, request, None), *_ask_missing_cars(there, request, words)]
         named, failed = _cars_to_stop(there, words)
-        return [*(there.ask(request_for(named), named) if named else ()), *failed]
+        return [*(ask(there, request_for(named), named) if named else ()), *failed]
 
-    with _client_that_stops(connect, fleet) as client:
+    client, hung = _client_that_stops(connect, fleet)
+    with client:
         end_with(client, [*in_all_fleets(client, connect, words, act), *wrong], as_json=as_json)
+
+
+def _ask_returning(client: Fleet, request: CommandRequest, named: Sequence[str] | None) -> list[Outcome]:
+    """Ask each of these cars, or all, when its gateway is on the bus again, which has just come back."""
+    pending, asked = [], set[str]()
+    until = time.monotonic() + REJOIN_S
+    is_over = False
+    while not is_over:
+        is_over = time.monotonic() >= until
+        wanted = named if named is not None and is_over else client.cars()
+        if cars := [each for each in wanted if each not in asked and (named is None or each in named)]:
+            pending.append(client.send(request, cars))
+            asked.update(cars)
+        if named is not None and asked >= {*named}:
+            break
+        time.sleep(0.0 if is_over else REJOIN_POLL_S)
+    return [each for command in pending for each in client.outcomes(command)] if pending else client.ask(request)
 
 
 def _cars_to_stop(client: Fleet, words: Sequence[str]) -> tuple[list[str], list[Outcome]]:

@@ -3,6 +3,7 @@
 import http.client
 import os
 import signal
+import threading
 import time
 
 import pytest
@@ -67,6 +68,16 @@ def test_stop_during_hub_hang_arrives_after_it(fleet: FleetProcesses, judge: Jud
     thawed_ns = time.time_ns()
     assert judge.wait_off(thawed_ns, watched_s=0.5) < STOP_TTL_S - frozen_s
     assert post_stop(console.port, "a") == 204
+
+
+@pytest.mark.soak
+def test_stop_command_waits_for_hung_hub(fleet: FleetProcesses, judge: Judge) -> None:
+    drive_by_a_mode(fleet, judge)
+    freeze(fleet.hub.pid)
+    threading.Timer(0.7 * STOP_TTL_S, os.kill, (fleet.hub.pid, signal.SIGCONT)).start()
+    done = fleet_command("stop", "red", environment=fleet.environment)
+    assert (done.returncode, done.stdout[:13]) == (0, "red: stopped ")
+    assert not judge.driving
 
 
 def test_stop_command_at_hung_hub_says_not_stopped(fleet: FleetProcesses, judge: Judge) -> None:
