@@ -28,7 +28,7 @@ uninstall=''
 
 # What a gateway and `fleet join`, `list`, `stop`, `drive` import: 90 MB with the virtual environment's own tools. The
 # whole package also brings what records and draws tables: another 50 MB.
-needs='click>=8.1 cryptography>=44 eclipse-zenoh>=1.10.2,<2 foxglove-schemas-protobuf>=0.4.0 ifaddr>=0.2 protobuf>=7.35.1,<8 pyserial>=3.5 segno>=1.6 zeroconf>=0.140'
+needs='click>=8.1 cryptography>=44 eclipse-zenoh>=1.10.2,<2 foxglove-schemas-protobuf>=0.4.0 ifaddr>=0.2 msgspec>=0.22 protobuf>=7.35.1,<8 pyserial>=3.5 segno>=1.6 zeroconf>=0.140'
 needs_ble='bleak>=3.1,<4'
 
 usage() {

@@ -2,7 +2,9 @@
 
 import re
 import subprocess
+import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 from typing import Final
 
@@ -17,11 +19,27 @@ CAR_IMPORTS: Final = {
     "eclipse-zenoh",
     "foxglove-schemas-protobuf",
     "ifaddr",
+    "msgspec",
     "protobuf",
     "pyserial",
     "segno",
     "zeroconf",
 }
+
+
+IMPORTED: Final = """
+import sys
+from importlib import import_module, metadata
+for name in (
+    "gateway.car", "gateway.cli", "gateway.stop_without_hub", "gateway.tools.scan",
+    "gateway.drivers.yahboom.driver", "gateway.drivers.waveshare.driver",
+    "fleet.cli", "fleet.commands.drive", "fleet.commands.hub", "fleet.commands.observe",
+):
+    import_module(name)
+known, names = metadata.packages_distributions(), {each.partition(".")[0] for each in sys.modules}
+print(*{each.lower() for name in names for each in known.get(name, ())})
+"""
+"""Prints the packages of which the modules of a car's computer import something."""
 
 
 def run(*words: str) -> "subprocess.CompletedProcess[str]":
@@ -77,3 +95,17 @@ def test_install_script_requirements_match_pyproject() -> None:
 
 def by_name(requirements: list[str]) -> dict[str, Requirement]:
     return {found.name: found for found in map(Requirement, requirements)}
+
+
+def test_car_imports_only_what_the_script_installs() -> None:
+    """On a car's computer, `fleet` and the gateway ended: msgspec was not installed there."""
+    done = subprocess.run([sys.executable, "-c", IMPORTED], capture_output=True, text=True, check=True)
+    installed, wanted = set[str](), [*CAR_IMPORTS]
+    while wanted:
+        name = wanted.pop()
+        if name not in installed:
+            installed.add(name)
+            needed = map(Requirement, metadata.requires(name) or ())
+            wanted += [each.name.lower() for each in needed if each.marker is None or each.marker.evaluate()]
+    # setuptools has a hook in each environment of it. msgspec imports typing_extensions if it is there.
+    assert {*done.stdout.split()} - installed - {"setuptools", "typing_extensions"} == {"zenoh-car-fleet"}
