@@ -114,8 +114,10 @@ class Fleet:
     `sender` raises keys.BadKey.
 
     While a Fleet is open, it has the liveliness token `<fleet>/@operator/<sender>` on the bus. If the token disappears,
-    for example because the program has crashed, gateways stop the cars that this client drives. So use a Fleet in a
-    `with` block, or call `close`. Otherwise the script ends with a ResourceWarning.
+    for example because the program has crashed, gateways end the drives of this client, and stop these cars. Modes that
+    it has opened go on. So use a Fleet in a `with` block, or call `close`. Otherwise the script ends with a
+    ResourceWarning.
+
     Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
     """
 

@@ -131,6 +131,7 @@ def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, a
         cars,
         lambda named: estop_request(why, Scope.FLEET if named is None else Scope.CAR),
         as_json=as_json,
+        lasts=" The emergency stop lasts until `fleet resume --estops`.",
     )
 
 
@@ -161,9 +162,11 @@ def _stop(
     request_for: Callable[[list[str] | None], CommandRequest],
     *,
     as_json: bool,
+    lasts: str = "",
 ) -> Never:
     """Stop the cars in every fleet that the command could mean. `request_for` makes the request for the named cars.
 
+    After Ctrl-C, `lasts` says what stays in force.
     A word that names no car fails, and the other cars are stopped all the same.
     """
     words = tuple(each for each in cars if keys.is_name(each.removeprefix("@")))
@@ -181,7 +184,12 @@ def _stop(
 
     client, hung = _client_that_stops(connect, fleet)
     with client:
-        end_with(client, [*in_all_fleets(client, connect, words, act), *wrong], as_json=as_json)
+        try:
+            outcomes = in_all_fleets(client, connect, words, act)
+        except KeyboardInterrupt:
+            click.echo(f"fleet: the stop was sent. Nothing shows yet that a car stands: look at it.{lasts}", err=True)
+            raise
+        end_with(client, [*outcomes, *wrong], as_json=as_json)
 
 
 def _ask_returning(client: Fleet, request: CommandRequest, named: Sequence[str] | None) -> list[Outcome]:

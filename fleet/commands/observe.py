@@ -440,7 +440,7 @@ def wait(
     """Wait until CONDITION is true for a reading of KEY, and print it. The latest one will do, unless it is stale.
 
     If KEY has a wildcard, one matching key is enough. CONDITION is written as for `fleet watch --when`. With --ready,
-    wait for cars instead. A car is ready when its link is open and the state of its motors is known.
+    wait for cars instead. A car is ready when its gateway answers and a command to it does not have to wait.
     """
     if ready:
         cars = [car for word in words for car in word.split(",") if car != "all"]

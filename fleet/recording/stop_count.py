@@ -5,13 +5,25 @@ A stop of several cars is one command with one id, and each gateway publishes se
 
 from typing import Any, Final
 
-from schemas.commands import STOPPING_VERBS
+from schemas.commands import STOPPING_VERBS, Verb
 from schemas.topics import TOPICS
-from schemas.words import Phase
+from schemas.words import Phase, Reason
 
 EVENTS: Final = TOPICS["event/command"]
 MAX_RECENT_IDS: Final = 1000
 """Maximum number of remembered ids. So many are enough, because the events of one command are at most seconds apart."""
+
+
+def stops_cars(event: Any) -> bool:
+    """Return True for an event of a command that stops cars.
+
+    A pause stops no car before its gateway has accepted it, because not everybody may pause a fleet. The message has
+    the schema of its recording, which may lack a field.
+    """
+    verb, phase, reason = (getattr(event, name, "") for name in ("verb", "phase", "reason"))
+    if verb != Verb.PAUSE:
+        return verb in STOPPING_VERBS
+    return phase != Phase.ASKED and (phase != Phase.REJECTED or reason == Reason.LINK_DOWN)
 
 
 class StopCount:
@@ -23,10 +35,9 @@ class StopCount:
 
     def add(self, event: Any) -> None:
         """Count a message of `EVENTS`. Messages of other types are ignored."""
-        # The message has the schema of the recording, which may lack a field.
-        verb, command, phase = (str(getattr(event, name, "")) for name in ("verb", "id", "phase"))
-        if event.DESCRIPTOR.full_name != EVENTS.message or verb not in STOPPING_VERBS:
+        if event.DESCRIPTOR.full_name != EVENTS.message or not stops_cars(event):
             return
+        command, phase = getattr(event, "id", ""), getattr(event, "phase", "")
         if not command:  # without an id, the events of one command cannot be told from others: count each car
             self.count += phase == Phase.ASKED
         elif command not in self._recent:

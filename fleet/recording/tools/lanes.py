@@ -14,9 +14,9 @@ from typing import Any, Final
 
 from msgspec import Struct, field
 
+from fleet.recording.stop_count import stops_cars
 from fleet.recording.tools.stop_findings import asked_by
 from schemas import keys
-from schemas.commands import STOPPING_VERBS
 from schemas.rights import binding_pause
 from schemas.topics import TOPICS
 from schemas.words import UNKNOWN, LinkState, Motion, Phase, Verdict
@@ -99,7 +99,7 @@ class Lanes(Struct):
                 is_lost = message.state in (LinkState.LOST, LinkState.STALE)
                 self._hold(car, Lane.LOSS, message.state if is_lost else "", at_ns, bad=is_lost)
                 self._silence(car, at_ns)
-            case "event/command" if message.verb in STOPPING_VERBS:
+            case "event/command" if stops_cars(message):
                 self._stop(car, message, at_ns)
             case _ if topic == MARK_TOPIC:
                 self.marks.append(LaneMark(at_ns, message.message, message.name))

@@ -9,6 +9,7 @@ from msgspec import Struct, field, to_builtins
 from fleet.client.diagnosis import DoctorFinding
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.stop_count import stops_cars
 from fleet.recording.tools.stop_findings import (
     NOT_SHOWN_CODE,
     NOT_STOPPED_CODE,
@@ -18,7 +19,6 @@ from fleet.recording.tools.stop_findings import (
 )
 from fleet.recording.tools.verify import SessionVerdict
 from schemas import keys
-from schemas.commands import STOPPING_VERBS
 from schemas.local_time import clock
 from schemas.words import Basis, Phase
 
@@ -61,7 +61,7 @@ class SessionCheckup(Struct):
         if topic == "event/log":
             self.broken[car] += log_code(message) == "link_lost"
         elif topic == "event/command":
-            is_stop = message.verb in STOPPING_VERBS
+            is_stop = stops_cars(message)
             if is_stop and (message.basis or message.phase == Phase.FAILED):
                 self.stops[message.basis or Phase.FAILED] += 1
             if message.phase in _REFUSED_PHASES and not is_stop:

@@ -12,8 +12,8 @@ from typing import Any, Final
 from msgspec import Struct, field
 
 from fleet.client.claims import claims_of
+from fleet.recording.stop_count import stops_cars
 from schemas import messages
-from schemas.commands import STOPPING_VERBS
 from schemas.keys import name_of
 from schemas.local_time import clock
 from schemas.words import UNKNOWN, LinkState, Phase, Reason, Shows
@@ -112,7 +112,7 @@ def failed_stop_code(topic: str, message: Any) -> str:
     if topic == "event/log":
         code = log_code(message)
         return code if code in (NOT_STOPPED_CODE, NOT_SHOWN_CODE) else ""
-    if message.verb not in STOPPING_VERBS or message.phase not in _FAILED:
+    if not stops_cars(message) or message.phase not in _FAILED:
         return ""
     return NOT_SHOWN_CODE if message.reason == NOT_SHOWN_CODE else NOT_STOPPED_CODE
 

@@ -13,6 +13,7 @@ from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
+from fleet.recording.session_lookup import find_session
 from fleet.recording.stop_count import EVENTS, StopCount
 from fleet.recording.tools.transform import lost_words
 from schemas import keys
@@ -252,7 +253,9 @@ def _state(session: Session, read: Session) -> tuple[SessionState, str]:
 
 def _recover(session: Session) -> str:
     """Return the command that repairs this session. It names the session, because the default is the newest one."""
-    return f"fleet sessions recover {shlex.quote(session.name)}"
+    found = find_session(session.name)
+    is_named = found.exists() and found.samefile(session.path)
+    return f"fleet sessions recover {shlex.quote(session.name if is_named else str(session.path))}"
 
 
 def _is_written_lately(session: Session) -> bool:

@@ -18,11 +18,11 @@ from fleet.fleetfile.fleet_file import PinRule
 from fleet.policy.car_condition import CarCondition
 from fleet.policy.snapshot import topic_of
 from fleet.recording.pins import Pin, minute_of
-from fleet.recording.stop_count import MAX_RECENT_IDS
+from fleet.recording.stop_count import MAX_RECENT_IDS, stops_cars
 from fleet.recording.tools.car_timeline import message_time_ns
 from fleet.recording.tools.stop_findings import asked_by, failed_stop_code
 from schemas import keys, messages
-from schemas.commands import STOPPING_VERBS, Verb
+from schemas.commands import Verb
 from schemas.topics import TOPICS
 from schemas.words import PinCause
 
@@ -114,7 +114,7 @@ class PinWatch:
         if failed_stop_code(topic, message):
             words = message.message if topic == "event/log" else message.words or message.reason
             yield PinCause.NOT_SHOWN, words, (car,)
-        if topic != "event/command" or message.verb not in STOPPING_VERBS:
+        if topic != "event/command" or not stops_cars(message):
             return
         words = asked_by(message)
         if message.verb == Verb.ESTOP:

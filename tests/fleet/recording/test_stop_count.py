@@ -12,6 +12,7 @@ from google.protobuf.message_factory import GetMessageClass
 
 from fleet.recording import session_dir
 from fleet.recording.stop_count import MAX_RECENT_IDS, StopCount
+from fleet.recording.tools.stop_findings import failed_stop_code
 from fleet.recording.tools.summary import SessionState, overview
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas.gen import fleet_v1_pb2 as pb
@@ -31,11 +32,26 @@ def test_stop_of_several_cars_counts_once() -> None:
     for verb, command, phase in itertools.product(("stop", "drive", "resume", "mode"), ("a", "b"), PHASES):
         found.add(event(verb, f"{verb} {command}", phase))
     assert found.count == 2
-    for verb in ("estop", "pause"):
-        found.add(event(verb, verb))
+    found.add(event("estop", "estop"))
+    assert found.count == 3
+    found.add(event("pause", "pause"))
+    assert found.count == 3, "it may be refused"
+    found.add(event("pause", "pause", "queued"))
     assert found.count == 4
     found.add(pb.Range(range_m=1.0))
     assert found.count == 4
+
+
+def test_refused_pause_is_no_stop() -> None:
+    found = StopCount()
+    for phase in ("asked", "rejected"):
+        found.add(pb.CommandEvent(verb="pause", id="a", phase=phase, reason="not_allowed" if phase != "asked" else ""))
+    assert found.count == 0
+    refused = pb.CommandEvent(verb="pause", id="a", phase="rejected", reason="not_allowed", words="no lead")
+    assert failed_stop_code("event/command", refused) == ""
+    cut = pb.CommandEvent(verb="pause", id="b", phase="rejected", reason="link_down")
+    found.add(cut)
+    assert (found.count, failed_stop_code("event/command", cut)) == (1, "not_stopped")
 
 
 def test_without_an_id_each_asked_one_counts() -> None:
@@ -62,7 +78,9 @@ def recorded(tmp_path: Path) -> Path:
     for at, (car, (verb, command), phase) in enumerate(itertools.product(("red", "blue"), commands, PHASES)):
         payload = event(verb, command, phase).SerializeToString()
         writer.add(f"fleet/{car}/event/command", payload, encoding, None, None, NOW + at)
-    writer.add("fleet/blue/event/command", event("pause", "4").SerializeToString(), encoding, None, None, NOW + 99)
+    writer.add(
+        "fleet/blue/event/command", event("pause", "4", "queued").SerializeToString(), encoding, None, None, NOW + 99
+    )
     writer.add("fleet/red/event/command", b"\xff\xff", encoding, None, None, NOW + 100)
     writer.add("fleet/red/event/command", b"no event", zenoh.Encoding("text/plain"), None, None, NOW + 101)
     writer.tick(NOW + 200)
