@@ -15,7 +15,7 @@ from fleet.commands.options import from_option, to_option
 from fleet.commands.output import progress_bar
 from fleet.commands.params import car_option, session_argument
 from schemas.printable import printable_lines
-from schemas.process import startup
+from schemas.process import signals, startup
 
 if TYPE_CHECKING:
     from fleet.recording.reading.session import Session
@@ -107,8 +107,15 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
     from fleet.replay.rerun.rrd_export import ExportFailed, export
 
     try:
-        with _progress_bar(session) as advance:
-            replayed = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", on_read=advance)
+        # Rerun calls Python for each chunk, and may lose an exception there. So Ctrl-C is noticed between two.
+        with _progress_bar(session) as advance, signals.held_back() as came:
+
+            def on_read(messages: int) -> None:
+                if came:
+                    raise KeyboardInterrupt
+                advance(messages)
+
+            replayed = export(session, out, part, tab=cars[0] if len(cars) == 1 else "", on_read=on_read)
     except ExportFailed as error:
         raise click.ClickException(str(error)) from None
     except OSError as error:

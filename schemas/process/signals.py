@@ -3,7 +3,7 @@
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -47,18 +47,18 @@ def _taken(numbers: Iterable[signal.Signals], handler: Callable[[int, FrameType 
 
 
 @contextmanager
-def held_back() -> Iterator[None]:
-    """Delay signals until the end of a block that must not be interrupted.
+def held_back() -> Iterator[Sequence[int]]:
+    """Delay signals until the end of a block that must not be interrupted. Yield the signals that have come so far.
 
     Do nothing in other threads and in a loop: no signal interrupts them.
     """
-    if threading.current_thread() is not threading.main_thread() or _in_loop():
-        yield
-        return
     came: list[int] = []
+    if threading.current_thread() is not threading.main_thread() or _in_loop():
+        yield came
+        return
     try:
         with _taken(signals(), lambda number, _: came.append(number)):
-            yield
+            yield came
     finally:
         for number in came:
             signal.raise_signal(number)

@@ -14,14 +14,16 @@ from fleet.recording.reading.mcap_reader import ChannelInfo, Extra, Row
 SESSION_METADATA: Final = "session"
 """Name of the metadata record that says to which session a file belongs."""
 CHUNK_NS: Final = 1_000_000_000
-"""Maximum time span of a chunk, as in the recorder's files. So reading a short part decompresses little more than that
-part."""
+"""Usual maximum time span of a chunk, as in the recorder's files. So reading a short part decompresses little more than
+that part."""
 
 
 class McapCopy:
     """One file to write. Every method may raise OSError. After an exception, the file stays without its end."""
 
-    def __init__(self, path: Path, about: Mapping[str, str] | None = None) -> None:
+    def __init__(self, path: Path, about: Mapping[str, str] | None = None, chunk_ns: int = CHUNK_NS) -> None:
+        self._span_ns = chunk_ns
+        """Maximum time span of a chunk."""
         self._file = path.open("xb")
         self._writer: Any = Writer(self._file, enable_data_crcs=True)
         self._writer.start(library=f"zenoh-car-fleet; {LIBRARY_IDENTIFIER}")
@@ -54,7 +56,7 @@ class McapCopy:
         entry = self._channel_ids.get(id(info))
         if entry is None:
             entry = self._channel_ids[id(info)] = (info, self._channel(info))
-        if self._chunk_ns is None or not 0 <= log_ns - self._chunk_ns < CHUNK_NS:
+        if self._chunk_ns is None or not 0 <= log_ns - self._chunk_ns < self._span_ns:
             if self._chunk_ns is not None:
                 self._writer.flush()
             self._chunk_ns = log_ns

@@ -36,6 +36,11 @@ class ChunkPlace(Struct, frozen=True):
     last_ns: int
     table: bytes
 
+    @property
+    def channel_count(self) -> int:
+        """Return the number of channels with messages in it. 0 if it has no table."""
+        return len(self.table) // _CHANNEL_ENTRY.size
+
     def may_contain(self, channels: frozenset[int]) -> bool:
         """Return True if it may contain messages of these channels. A chunk without a table may contain any."""
         return not self.table or any(channel in channels for channel, _ in _CHANNEL_ENTRY.iter_unpack(self.table))

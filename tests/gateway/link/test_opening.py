@@ -141,7 +141,7 @@ async def test_unopenable_serial_port_is_refused(tmp_path: Path) -> None:
     assert "not a serial port (" in await refused(SerialUrl(str(regular)))
     assert "not a serial port (" in await refused(SerialUrl("/dev/null"))
     assert "no such port" in await refused(SerialUrl("COM99"))
-    assert "(embedded null byte)" in await refused(SerialUrl("/dev/tty\0"))
+    assert "embedded null" in await refused(SerialUrl("/dev/tty\0"))
     await no_threads()
 
 

@@ -350,7 +350,7 @@ def test_simulator_announces_cars_takes_faults_and_ends_clean(
     sim.popen.stdin.write("[" * 60_000 + "\n")
     answer = sim.line()
     assert not answer["ok"]
-    assert "too deep" in answer["error"]
+    assert "JSON" in answer["error"], "too deep, or from Python 3.14 on, without an end"
     assert sim.ask(car="red", fault="link_drop")["ok"]
     assert not path.is_symlink()
     assert sim.ask(car="red", fault="link_drop", for_s=0)["ok"]

@@ -16,10 +16,13 @@ import rerun.chunk as rrc
 from click.testing import CliRunner
 
 from fleet.commands.replay import replay
+from fleet.recording.reading.mcap_copy import McapCopy
+from fleet.recording.reading.mcap_reader import McapReader
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import FLEET_FILE
 from fleet.replay import panels
 from fleet.replay.rerun import lenses, rrd_export
+from fleet.replay.rerun.prepare import MIN_RUNS
 from schemas.messages import message_class
 from schemas.topics import TOPICS
 from tests.fleet.replay.make_session import CARS, START_NS, make
@@ -46,6 +49,25 @@ def test_rrd_has_every_message_and_layout(made: tuple[Path, Counter[str]], tmp_p
     assert recording.application_id == layout.application_id == rrd_export.APPLICATION
     assert recording.recording_id == Session(path).name
     assert list(tmp_path.iterdir()) == [out]
+
+
+def test_session_with_one_message_in_each_chunk_makes_large_chunks(
+    made: tuple[Path, Counter[str]], tmp_path: Path
+) -> None:
+    """The recorder ends a chunk each second, so it has few messages of each key in it."""
+    path, counts = made
+    with McapCopy(tmp_path / "0001.mcap", chunk_ns=1) as copy:
+        for row in Session(path).rows():
+            copy.add(row)
+    index = McapReader(tmp_path / "0001.mcap").index()
+    assert index is not None
+    assert len(index.chunks) > MIN_RUNS
+    out, whole = tmp_path / "out.rrd", tmp_path / "whole.rrd"
+    assert rrd_export.export(Session(tmp_path / "0001.mcap"), out).shown == counts
+    assert rrd_export.rows(out) == counts
+    rrd_export.export(Session(path), whole)
+    found, wanted = (len(list(rrc.RrdReader(each).store().stream())) for each in (out, whole))
+    assert found < 2 * wanted
 
 
 def test_cars_have_the_colors_of_the_fleet_file(made: tuple[Path, Counter[str]], tmp_path: Path) -> None:
