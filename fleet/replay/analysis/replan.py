@@ -186,7 +186,7 @@ class Replanning:
         self._observer.forget(at_ns / 1e9, {*self._plan.named_cars, *self._state.held_roles})
         result = step(self._plan, self._observer.snapshot(self._busy), self._state, at_ns / 1e9)
         self._state = result.memory
-        for each in result.changed:
+        for each in (*result.changed, *result.reworded):  # as the coordinator publishes them
             decision = RecordedDecision(
                 at_ns, each.kind, each.decided, each.role or "", each.why, each.readings, each.would_change
             )

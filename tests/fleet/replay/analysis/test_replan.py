@@ -33,7 +33,7 @@ S = 1_000_000_000
 PLAN = """
 roles:
   track: {mode: tracking, cars: [red]}
-fixed: {blue: {mode: manual}, green: {mode: manual}}
+  rest: {mode: manual, cars: [blue, green], count: all}
 rules:
   - name: spinning
     when: {car: green, is: motion.motion == 'spin_left'}
