@@ -95,7 +95,8 @@ def _open(path: Path) -> "Session":
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     """List the sessions in DIR (default: sessions): start, state, length, size, lost messages, stops, marks and cars.
 
-    A stop of several cars counts once, whoever asked for it. The list also shows damaged sessions, and what is damaged.
+    A stop of several cars counts once, whoever asked for it. The list also shows damaged sessions, and what is damaged,
+    as far as their indexes tell. Only `fleet sessions verify` reads every message.
     """
     _show(_summaries(directory), as_json=as_json)
     if not as_json:
