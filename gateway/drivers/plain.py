@@ -14,7 +14,6 @@ again every few seconds, because its frames may have been lost.
 """
 
 from abc import abstractmethod
-from collections import deque
 from collections.abc import Mapping
 from typing import ClassVar, Final
 
@@ -225,8 +224,8 @@ class PlainDriver(Driver):
         self._shutting_down = False
         self._ends_at = float("inf")
         self._not_stopped = ""
-        self._unasked_at: deque[float] = deque(maxlen=UNASKED_REPORTS)
-        """Times of the last readings, without a break, that show turning wheels while the car should stand."""
+        self._unasked, self._unasked_since = 0, float("-inf")
+        """Number of readings in a row that show turning wheels at rest, and the time of the first."""
         self._unasked_log_at = float("-inf")
 
     # ------------------------------------------------------------------ for a family to define
@@ -306,10 +305,11 @@ class PlainDriver(Driver):
             self._begin_again(words, TrustEvent.HEARD, now)
         self.on_reading(event, now)
         if not (model.at_rest and model.turned_at >= event.at):
-            self._unasked_at.clear()
+            self._unasked = 0
             return
-        self._unasked_at.append(event.at)
-        if len(self._unasked_at) == UNASKED_REPORTS and event.at >= self._unasked_at[0] + UNASKED_S:
+        self._unasked_since = event.at if self._unasked == 0 else self._unasked_since
+        self._unasked += 1
+        if self._unasked >= UNASKED_REPORTS and event.at >= self._unasked_since + UNASKED_S:
             told = (f"{model.name} moves, and nobody here drives it.", self.MOVES_UNASKED, "The gateway stops it.")
             words = " ".join(filter(None, told))
             if self.may_log_unasked(now):

@@ -151,17 +151,20 @@ class Rolls(tank.TankDriver):
             self.show_rest("it is near", now)
 
 
-def test_car_that_moves_unasked_is_stopped_and_named() -> None:
+@pytest.mark.parametrize("interval_s", [0.02, 0.2])
+def test_car_that_moves_unasked_is_stopped_and_named(interval_s: float) -> None:
     bench = Bench(cast("Family", SimpleNamespace(driver_of=lambda name, kept: Rolls)), "tank", tank.SAMPLES)
     bench.control.link_up(bench.now)
     bench.run(2.0)
-    model = bench.control.driver.model
+    driver, model = bench.control.driver, bench.control.driver.model
     assert (model.trust.state, model.basis, model.shows_stops[0]) == (CarTrust.STOPPED, Basis.SHOWN, Shows.YES)
-    before = len(bench.sent)
-    bench.samples = (b'{"v":7.9,"dist_cm":200}\n',)
-    bench.run(2.0)
+    began, bench.samples = bench.now, ()
+    for _ in range(round(1.0 / interval_s)):
+        for event in driver.feed(b'{"v":7.9,"dist_cm":200}\n', bench.now):
+            driver.on_event(event, bench.now)
+        bench.run(interval_s)
     assert (model.motors, model.basis) != (Motors.OFF, Basis.SHOWN)
-    assert bench.stop_frames(bench.sent[before][0])
+    assert bench.stop_frames(began)
 
 
 def test_silent_car_is_stopped_again_and_again(bench: TankBench) -> None:
