@@ -30,7 +30,7 @@ chunk each second, so its runs have one or two messages. Five minutes of five ca
 3 s and 10 MB."""
 MIN_RUNS: Final = 500
 """Minimum number of runs for which a copy pays."""
-CHUNK_NS: Final = 60_000_000_000
+COPY_CHUNK_NS: Final = 60_000_000_000
 """Maximum time span of a chunk in the copies. The MCAP writer also ends a chunk at 1 MiB."""
 MAX_VARIANTS: Final = 16
 """Maximum number of copies. If a key has more schemas than this, the remaining ones share the last copy."""
@@ -114,7 +114,7 @@ def copied(
                 continue
             while len(copies) <= number:
                 path = scratch / f"{len(copies) + 1:04d}.mcap"
-                copies.append(stack.enter_context(McapCopy(path, chunk_ns=CHUNK_NS)))
+                copies.append(stack.enter_context(McapCopy(path, chunk_ns=COPY_CHUNK_NS)))
                 prepared.files.append(path)
             copies[number].add(row)
     return prepared
