@@ -20,6 +20,8 @@ USABLE_S = 15.0
 """Maximum time from the connect until a car is ready for a command."""
 MOVES_S = 1.5
 """Maximum time from the command to the motors of a car that has an echo: a probe may block it for a second."""
+MODE_TRIES, MODE_S = 2, 15.0
+"""How often a mode is commanded, because a busy car may lose its frame, and how long it may take."""
 
 
 @dataclass(frozen=True)
@@ -110,13 +112,23 @@ def test_drive_starts_at_once_and_is_described(cars: KindsUnderTest) -> None:
         wait_for(lambda kind=kind: not driving(cars.sim, kind.name), f"{kind.name} stands")
 
 
+def untracking(cars: KindsUnderTest, kinds: tuple[CarKind, ...]) -> tuple[CarKind, ...]:
+    """Return the cars that do not track."""
+    return tuple(kind for kind in kinds if truth(cars, kind)["mode"] != "tracking")
+
+
 @pytest.mark.xdist_group("any_car")
 def test_mode_opens_and_stays_and_a_stop_stops(cars: KindsUnderTest) -> None:
     with_modes = tuple(kind for kind in KINDS if kind.modes)
-    for name, (code, outcome) in commands(cars, "mode", "tracking", kinds=with_modes).items():
-        assert code == 0, (name, str(outcome))
-    for kind in with_modes:
-        wait_for(lambda kind=kind: truth(cars, kind)["mode"] == "tracking", f"{kind.name} tracks")
+    waiting = with_modes
+    for _ in range(MODE_TRIES):
+        for name, (code, outcome) in commands(cars, "mode", "tracking", kinds=waiting).items():
+            assert code == 0, (name, str(outcome))
+        until = time.monotonic() + MODE_S
+        wait_for(lambda until=until: time.monotonic() > until or not untracking(cars, with_modes), "the modes open")
+        if not (waiting := untracking(cars, with_modes)):
+            break
+    assert not [kind.name for kind in waiting]
     stays_until = time.monotonic() + 5.0
     wait_for(lambda: time.monotonic() > stays_until, "five seconds pass")
     for kind in with_modes:
