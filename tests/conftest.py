@@ -1,6 +1,7 @@
-"""Collects tests, spreads them over workers, removes the deadline of Hypothesis' examples, and sets signals."""
+"""Collects tests, spreads them over workers, removes the deadline of Hypothesis' examples, sets signals and logging."""
 
 import gc
+import logging
 from collections.abc import Generator
 
 import pytest
@@ -62,3 +63,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if any(each.scope == "module" for each in used):
                 item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
     scheduling.sort(items)
+
+
+def pytest_runtest_teardown() -> None:
+    """Enable logging again, which the completion of a shell disables for the rest of its process."""
+    logging.disable(logging.NOTSET)
