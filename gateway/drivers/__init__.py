@@ -25,7 +25,7 @@ BUILT_IN: Final = {
 }
 """Module of each family that comes with the gateway."""
 GROUP: Final = "zenoh_car_fleet.drivers"
-NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
+_NAMES: Final = ("PLATFORMS", "profile_of", "profiles", "driver_of")
 """The names of `Family`."""
 broken: Final[dict[str, str]] = {}
 """The drivers of other packages that could not be imported, with the reason."""
@@ -45,6 +45,11 @@ class Family(Protocol):
 
     def driver_of(self, name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], Driver]":
         """Return a function that makes a car's driver. `kept` is the saved result of `Driver.kept`, or empty."""
+
+
+def missing_names(module: object) -> list[str]:
+    """Return the names of `Family` that a module does not have."""
+    return [name for name in _NAMES if not hasattr(module, name)]
 
 
 def check_platform(text: str) -> str:
@@ -170,7 +175,7 @@ def _installed() -> tuple[tuple[str, Family], ...]:
     for each in entry_points(group=GROUP):
         try:
             family = cast("Family", each.load())
-            missing = [name for name in NAMES if not hasattr(family, name)]
+            missing = missing_names(family)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a mistake here must not keep other cars from running
             broken[each.name] = f"{each.value} cannot be imported: {type(error).__name__}: {error}"
             continue

@@ -35,7 +35,7 @@ from gateway.control.commands import (
 from gateway.control.control_output import CommandRecord, frame_of
 from gateway.control.controller import Controller
 from gateway.control.driver import TICK_S, Driver, Event
-from gateway.drivers import BUILT_IN, NAMES, Family, built_in_platforms
+from gateway.drivers import BUILT_IN, Family, built_in_platforms, missing_names
 from gateway.drivers.plain import SPEED_STEP, PlainDriver
 from schemas import messages
 from schemas.commands import COMMANDS
@@ -721,7 +721,7 @@ def main(arguments: list[str]) -> int:
     for name in arguments:
         try:
             family: Any = import_module(name)
-            missing = [each for each in NAMES if not hasattr(family, each)]
+            missing = missing_names(family)
         except (Exception, SystemExit) as error:  # noqa: BLE001 - a module may raise anything
             sys.stderr.write(f"gateway.drivers.check: {name} cannot be imported: {type(error).__name__}: {error}\n")
             return 2

@@ -207,7 +207,7 @@ class PlainDriver(Driver):
     SILENCE_S: ClassVar[float | None] = None
     """The longest normal silence, or None if every silence is normal."""
     MOVES_UNASKED: ClassVar[str] = ""
-    """What may drive such a car beside us, and what to do about it, in whole sentences."""
+    """Names other programs that may drive such a car, and says what to do about them, in whole sentences."""
 
     def __init__(self, desk: Desk, profile: CarProfile) -> None:
         super().__init__(desk)

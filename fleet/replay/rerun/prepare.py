@@ -7,7 +7,7 @@ first schema of each key into one file, those of the second into another, and so
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -131,11 +131,10 @@ def unreadable(session: Session, selection: Selection, wanted: Wanted) -> Counte
     return found
 
 
-def _is_scattered(indexes: Iterable[Index | None]) -> bool:
+def _is_scattered(indexes: list[Index | None]) -> bool:
     """Return True if the chunks of these files have so few messages of each key that a copy pays."""
-    there = [index for index in indexes if index is not None]
-    runs = sum(chunk.channel_count for index in there for chunk in index.chunks)
-    return runs >= MIN_RUNS and sum(_total(there).values()) < MIN_RUN * runs
+    runs = sum(chunk.channel_count for index in indexes if index is not None for chunk in index.chunks)
+    return runs >= MIN_RUNS and _total(indexes).total() < MIN_RUN * runs
 
 
 def _is_plain(index: Index) -> bool:
@@ -179,7 +178,7 @@ def _aborts(decoder: MessageDecoder, row: Row) -> bool:
     return message is not None and has_unknown_enum(message)
 
 
-def _total(indexes: Iterable[Index | None]) -> Counter[str]:
+def _total(indexes: list[Index | None]) -> Counter[str]:
     total: Counter[str] = Counter()
     for index in indexes:
         total.update(index.counts if index is not None else {})

@@ -350,7 +350,8 @@ def test_simulator_announces_cars_takes_faults_and_ends_clean(
     sim.popen.stdin.write("[" * 60_000 + "\n")
     answer = sim.line()
     assert not answer["ok"]
-    assert "JSON" in answer["error"], "too deep, or from Python 3.14 on, without an end"
+    # Python 3.14 parses JSON of any depth, and misses its end.
+    assert ("too deep" if sys.version_info < (3, 14) else "not JSON") in answer["error"]
     assert sim.ask(car="red", fault="link_drop")["ok"]
     assert not path.is_symlink()
     assert sim.ask(car="red", fault="link_drop", for_s=0)["ok"]
