@@ -49,76 +49,81 @@ def _fill(gaps: list[Gap], number: int) -> bool:
     return False
 
 
+class TrackedSender(Struct):
+    """The received messages of one sender of a key."""
+
+    last: int
+    """The newest number."""
+    first: int
+    heard_ns: int = 0
+    """When the newest message was received, ns. 0 if none was."""
+    gaps: list[Gap] = field(default_factory=list)
+    """Gaps that a backfill may still close."""
+
+
 class SequenceTracker:
     """Tracks the live and backfilled messages of one key. Numbers count from 1, modulo 2^32.
 
     Call `add_live` only if the number does not follow `last` of its sender. For a consecutive number, the caller sets
-    `last` itself.
+    `last` itself. The caller also sets `heard_ns`.
     """
 
-    __slots__ = ("_early", "_first", "_gaps", "_lost", "last")
+    __slots__ = ("_early", "_lost", "senders")
 
     def __init__(self) -> None:
-        self.last: dict[Hashable, int] = {}
-        self._first: dict[Hashable, int] = {}
-        self._gaps: dict[Hashable, list[Gap]] = {}
+        self.senders: dict[Hashable, TrackedSender] = {}
         self._early: dict[tuple[Hashable, int], int] = {}
         self._lost = 0
 
     @property
     def missing(self) -> int:
         """Return the number of missing messages."""
-        return self._lost + sum(gap.count for gaps in self._gaps.values() for gap in gaps)
-
-    @property
-    def has_gaps(self) -> bool:
-        """True if a backfill may still close a gap."""
-        return bool(self._gaps)
+        return self._lost + sum(gap.count for sender in self.senders.values() for gap in sender.gaps)
 
     def add_live(self, sender: Hashable, number: int, published_ns: int) -> bool:
         """Add a message that is not consecutive. Return False if it was backfilled before."""
-        last = self.last.get(sender)
-        if last is None:
+        known = self.senders.get(sender)
+        if known is None:
             self._begin(sender, number)
             return True
-        ahead = (number - last) % _MODULO
+        ahead = (number - known.last) % _MODULO
         if 0 < ahead < _BACKWARD:
-            self._skip(sender, last, ahead)
-            self.last[sender] = number
+            self._skip(known, known.last, ahead)
+            known.last = number
             return True
         if self._early.get((sender, number)) == published_ns:
             del self._early[sender, number]
             return False
-        if self._close(sender, number):  # it fills a gap: a newer backfilled message came before it
+        if _fill(known.gaps, number):  # it fills a gap: a newer backfilled message came before it
             return True
-        self._forget(sender)  # the sender restarted its count, so this is not a gap of four billion messages
-        self._begin(sender, number)
+        self._restart(known, number)  # the sender restarted its count, so this is not a gap of four billion messages
         return True
 
     def add_dropped(self, sender: Hashable, number: int, count: int) -> None:
         """Add a gap of `count` messages that came but were dropped. `number` is that of the last one."""
-        if sender not in self.last:
-            self._begin(sender, (number - count) % _MODULO)
-            self._first[sender] = (number - count + 1) % _MODULO
-        ahead = (number - self.last[sender]) % _MODULO
+        known = self.senders.get(sender)
+        if known is None:
+            known = self._begin(sender, (number - count) % _MODULO)
+            known.first = (number - count + 1) % _MODULO
+        ahead = (number - known.last) % _MODULO
         if 0 < ahead < _BACKWARD:
-            self._skip(sender, self.last[sender], ahead + 1)
-            self.last[sender] = number
+            self._skip(known, known.last, ahead + 1)
+            known.last = number
 
     def add_backfilled(self, sender: Hashable, number: int, published_ns: int) -> bool:
         """Add a backfilled message. Return False if it is a duplicate."""
-        last = self.last.get(sender)
-        if last is None:
+        known = self.senders.get(sender)
+        if known is None:
             self._begin(sender, number)
             self._expect(sender, number, published_ns)
-        elif 0 < (ahead := (number - last) % _MODULO) < _BACKWARD:
-            self._skip(sender, last, ahead)
-            self.last[sender] = number
+        elif 0 < (ahead := (number - known.last) % _MODULO) < _BACKWARD:
+            self._skip(known, known.last, ahead)
+            known.last = number
             self._expect(sender, number, published_ns)
-        elif 0 < (before := (self._first[sender] - number) % _MODULO) < _BACKWARD:
-            self._skip(sender, number, before)
-            self._first[sender] = number
-        elif not self._close(sender, number):
+        elif 0 < (before := (known.first - number) % _MODULO) < _BACKWARD:
+            self._skip(known, number, before)
+            known.first = number
+        elif not _fill(known.gaps, number):
             return False
         return True
 
@@ -129,37 +134,30 @@ class SequenceTracker:
         if len(self._early) > MAX_EARLY_BACKFILLS:
             del self._early[next(iter(self._early))]
 
-    def _begin(self, sender: Hashable, number: int) -> None:
+    def _begin(self, sender: Hashable, number: int) -> TrackedSender:
         """Add a sender. Messages before its first number precede this recording, and are not a gap."""
-        if len(self.last) >= MAX_TRACKED_SOURCES:
-            oldest = next(iter(self.last))
-            self._forget(oldest)
-            del self.last[oldest]
-        self.last[sender] = self._first[sender] = number
+        if len(self.senders) >= MAX_TRACKED_SOURCES:
+            oldest = self.senders.pop(next(iter(self.senders)))
+            self._lost += sum(gap.count for gap in oldest.gaps)
+        self.senders[sender] = known = TrackedSender(number, number)
+        return known
 
-    def _skip(self, sender: Hashable, below: int, distance: int) -> None:
+    def _restart(self, known: TrackedSender, number: int) -> None:
+        self._lost += sum(gap.count for gap in known.gaps)
+        known.gaps.clear()
+        known.last = known.first = number
+
+    def _skip(self, known: TrackedSender, below: int, distance: int) -> None:
         """Add the gap between two received numbers."""
         if distance == 1:
             return
-        gaps = self._gaps.setdefault(sender, [])
         first, last = (below + 1) % _MODULO, (below + distance - 1) % _MODULO
         if first > last:  # the gap spans the wrap
-            gaps.append(Gap(first, _MODULO - 1))
+            known.gaps.append(Gap(first, _MODULO - 1))
             first = 0
-        gaps.append(Gap(first, last))
-        while len(gaps) > MAX_OPEN_GAPS:
-            self._lost += gaps.pop(0).count
-
-    def _close(self, sender: Hashable, number: int) -> bool:
-        gaps = self._gaps.get(sender, [])
-        filled = _fill(gaps, number)
-        if filled and not gaps:
-            del self._gaps[sender]
-        return filled
-
-    def _forget(self, sender: Hashable) -> None:
-        self._lost += sum(gap.count for gap in self._gaps.pop(sender, []))
-        self._first.pop(sender, None)
+        known.gaps.append(Gap(first, last))
+        while len(known.gaps) > MAX_OPEN_GAPS:
+            self._lost += known.gaps.pop(0).count
 
 
 class PublisherSequence(Struct):

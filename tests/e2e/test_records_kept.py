@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from fleet.recording.writing import backfill
+from fleet.recording.writing import backfill_plan
 from fleet.recording.writing.recorder import SHUTDOWN_DRAIN_S, Recorder
 from schemas import bus
 from schemas.gen import fleet_v1_pb2 as pb
@@ -77,7 +77,7 @@ def test_events_without_hub_are_published_when_it_returns(fleet: FleetProcesses)
 def test_hub_hang_at_end_of_recording_loses_no_message(
     fleet: FleetProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(backfill, "QUERY_AFTER_START_S", ())  # a query at the end waits for the hub, too
+    monkeypatch.setattr(backfill_plan, "QUERY_AFTER_START_S", ())  # a query at the end waits for the hub, too
     key = "fleet/red/sensor/range"
     with bus.Bus.open(fleet.endpoint) as own:
         recorder = Recorder(own, "fleet", tmp_path)

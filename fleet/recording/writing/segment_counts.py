@@ -17,7 +17,7 @@ _EVENT_CLASS: Final = messages.message_class(EVENTS.message)
 class KeyState:
     """Counters of one key and encoding in one segment."""
 
-    __slots__ = ("channel", "count", "encoding", "final", "first", "has_events", "key", "seen_ns", "tracker")
+    __slots__ = ("channel", "count", "encoding", "final", "first", "has_events", "key", "tracker")
 
     def __init__(self, key: str, encoding: zenoh.Encoding, tracker: SequenceTracker, channel: int) -> None:
         self.key = key
@@ -25,8 +25,6 @@ class KeyState:
         self.tracker = tracker
         self.channel = channel
         self.count = self.first = self.final = 0
-        self.seen_ns = 0
-        """When the newest message of the key was received, even if it is in an earlier segment. 0 if there was none."""
         self.has_events = messages.name_in(str(encoding)) == EVENTS.message
         """True for the events of commands, in which stops are counted."""
 

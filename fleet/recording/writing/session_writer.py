@@ -18,7 +18,7 @@ from msgspec import Struct, field
 from fleet.quota import Quota
 from fleet.recording import session_dir
 from fleet.recording.pins import Pin, PinList
-from fleet.recording.sequence_tracker import SequenceTracker
+from fleet.recording.sequence_tracker import SequenceTracker, TrackedSender
 from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume
@@ -84,8 +84,8 @@ class SessionWriter:
         self._irregular_keys: set[str] = set()
         """Keys whose sequence numbers were not always consecutive."""
         self.gaps: dict[str, int] = {}
-        """Keys with new gaps, each with the time of the last message before the gap (0 if there was none). The recorder
-        requests a backfill for them and clears them."""
+        """Keys with new gaps, each with the time of the sender's last message before the gap (0 if there was none). The
+        recorder requests a backfill for them and clears them."""
         self._drops: dict[str, int] = {}
         """Lost messages by key: those that did not fit on the disk, and those without a number that did not fit into
         the queue."""
@@ -135,16 +135,16 @@ class SessionWriter:
             sequence = (source.source_sn + 1) & 0xFFFFFFFF  # inlined schemas.bus.sequence_of
             entity = source.source_id
             sender = (entity.zid, entity.eid)  # an EntityGlobalId itself compares by identity
-            last = state.tracker.last
-            if last.get(sender) == sequence - 1:
-                last[sender] = sequence
+            known = state.tracker.senders.get(sender)
+            if known is not None and known.last == sequence - 1:
+                known.last = sequence
             else:
                 if not state.tracker.add_live(sender, sequence, published_ns):
                     return
+                known = state.tracker.senders[sender]
                 self._irregular_keys.add(key)
-                if state.tracker.has_gaps:
-                    self.gaps.setdefault(key, state.seen_ns)
-        state.seen_ns = received_ns
+                self._request(key, known)
+            known.heard_ns = received_ns
         self._unflushed.append((state, received_ns, payload, published_ns, sequence))
         if self.full:
             self._limit_buffer()
@@ -471,8 +471,12 @@ class SessionWriter:
         tracker.add_dropped(sender, number, count)
         self._overflows[key] = self._overflows.get(key, 0) + count
         self._irregular_keys.add(key)
-        if tracker.has_gaps:
-            self.gaps.setdefault(key, self._states[key].seen_ns if key in self._states else 0)
+        self._request(key, tracker.senders[sender])
+
+    def _request(self, key: str, sender: TrackedSender) -> None:
+        """Request a backfill of a key if messages of this sender are missing."""
+        if sender.gaps:
+            self.gaps[key] = min(sender.heard_ns, self.gaps.get(key, sender.heard_ns))
 
     def _drop_buffered(self) -> int:
         """Drop the buffer, and return the number of its messages."""

@@ -8,12 +8,17 @@ from hypothesis import strategies as st
 from fleet.recording.sequence_tracker import MAX_TRACKED_SOURCES, SequenceTracker
 
 
+def is_next(numbers: SequenceTracker, sender: str, number: int) -> bool:
+    known = numbers.senders.get(sender)
+    return known is not None and known.last == number - 1
+
+
 def live(numbers: SequenceTracker, *given: int, sender: str = "a") -> list[bool]:
     """Add numbers as the recorder does, which checks only numbers out of sequence."""
     found = []
     for number in given:
-        if numbers.last.get(sender) == number - 1:
-            numbers.last[sender] = number
+        if is_next(numbers, sender, number):
+            numbers.senders[sender].last = number
             found.append(True)
         else:
             found.append(numbers.add_live(sender, number, number * 10))
@@ -30,7 +35,7 @@ def test_gap_is_missing_until_filled_and_duplicates_are_told() -> None:
     assert not numbers.add_backfilled("a", 6, 60)
     assert numbers.add_backfilled("a", 7, 70)
     assert numbers.add_backfilled("a", 9, 90)
-    assert (numbers.missing, numbers.has_gaps) == (0, False)
+    assert (numbers.missing, numbers.senders["a"].gaps) == (0, [])
 
 
 def test_first_message_starts_stream_and_gap_before_is_missing() -> None:
@@ -88,15 +93,14 @@ def test_oldest_senders_are_forgotten_but_not_their_gaps() -> None:
     for sender in range(MAX_TRACKED_SOURCES * 3):
         live(numbers, 1, 3, sender=str(sender))
     assert numbers.missing == MAX_TRACKED_SOURCES * 3
-    assert len(numbers.last) == MAX_TRACKED_SOURCES
+    assert len(numbers.senders) == MAX_TRACKED_SOURCES
 
 
 @given(st.sets(st.integers(1, 60)), st.integers(0, 2**32))
 def test_each_message_is_taken_once_for_random_loss_and_backfill(lost: set[int], seed: int) -> None:
     chance, numbers, taken = random.Random(seed), SequenceTracker(), []
     for number in range(1, 61):
-        if number not in lost and (numbers.last.get("a") == number - 1 or numbers.add_live("a", number, number)):
-            numbers.last["a"] = number
+        if number not in lost and all(live(numbers, number)):
             taken.append(number)
         if chance.random() < 0.1:  # now and then, all cached messages are backfilled
             taken += [old for old in range(max(1, number - 20), number + 1) if numbers.add_backfilled("a", old, old)]

@@ -143,18 +143,24 @@ def test_sequence_gaps_are_counted_and_restart_is_none(endpoint: str, bus: Bus, 
 
 
 def test_messages_of_cut_off_car_are_backfilled(endpoint: str, bus: Bus, tmp_path: Path) -> None:
-    """The recorder stays connected, so it hears of the gap only after it, with the next message of the car."""
+    """The recorder stays connected, so it hears of the gap only after it, with the next message of the car.
+
+    A command event shows no gap, because none comes after it.
+    """
     tap = Tap(endpoint.replace("tcp/", "tcp://"))
     with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()
         ranges = publisher(car, "red", "sensor/range")
         ranges.put(pb.Range(range_m=1.0), time.time_ns())
+        events = publisher(car, "red", "event/command")
+        events.put(pb.CommandEvent(verb="stop"), time.time_ns())
         heard(car._session)
         tap.reset()
         wait_for(lambda: not car.hubs, "the car is cut off")
         for _ in range(20):
             ranges.put(pb.Range(range_m=2.0), time.time_ns())
+        events.put(pb.CommandEvent(verb="estop"), time.time_ns())
         time.sleep(2 * LEASE_POLLS * BACKFILL_POLL_INTERVAL_S)  # not a wait: how long it is cut off
         tap.accept()
         wait_for(lambda: car.hubs, "the car is back")
@@ -162,7 +168,9 @@ def test_messages_of_cut_off_car_are_backfilled(endpoint: str, bus: Bus, tmp_pat
         heard(car._session)
         outcome = recorder.close()
     assert outcome.missed == {}
-    assert Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))["fleet/red/sensor/range"] == 22
+    held = Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))
+    assert held["fleet/red/sensor/range"] == 22
+    assert held["fleet/red/event/command"] == 2
 
 
 @pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])

@@ -164,3 +164,21 @@ def test_files_are_copied_into_each_session(tmp_path: Path) -> None:
     assert after.uncopied == [f"{plan} could not be copied into {after.path}: No such file or directory"]
     after.close(BEGUN_NS + SECOND_NS)
     assert verify(Session(after.path)).whole
+
+
+def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
+    """While two sites are cut off from each other, the recorder of each publishes the status of the fleet."""
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    with zenoh.open(zenoh.Config.from_json5('{"scouting": {"multicast": {"enabled": false}}}')) as one:
+        senders = [one.declare_publisher("fleet/@recorder/status").id for _ in range(2)]
+    assert senders[0].eid != senders[1].eid
+    for second, (sender, number) in enumerate([(0, 1), (1, 1), (1, 2), (1, 3), (0, 4), (1, 5)]):
+        source = zenoh.SourceInfo(senders[sender], number)
+        tape.add("fleet/@recorder/status", b"{}", JSON, None, source, BEGUN_NS + second * SECOND_NS)
+        gaps = dict(tape.gaps)
+        if second == 4:
+            assert gaps == {"fleet/@recorder/status": BEGUN_NS}
+            tape.gaps.clear()
+    assert gaps == {"fleet/@recorder/status": BEGUN_NS + 3 * SECOND_NS}
+    assert tape.missed == {"fleet/@recorder/status": 3}
+    tape.close(BEGUN_NS + 9 * SECOND_NS)
