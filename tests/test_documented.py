@@ -13,6 +13,7 @@ import pytest
 
 from fleet.cli import cli
 from fleet.client.diagnosis import CHECKS
+from fleet.commands.params import Choice
 from schemas.commands import COMMANDS
 from schemas.words import Mode, Reason
 from tests.support.sources import GROUP, PRODUCT, ROOT, nodes, source_files, text
@@ -40,6 +41,8 @@ def test_each_command_has_an_example_and_each_option_its_words(words: str, comma
     page = read(f"docs/reference/cli/{name}.md")
     missing = [each.opts[0] for each in options(command) if isinstance(each, click.Option) and not each.help]
     assert missing == [], "options without help"
+    choices = [word for each in options(command) if isinstance(each.type, Choice) for word in each.type.choices]
+    assert [word for word in choices if word not in page] == []
     shown = [each.opts[0] for each in options(command) if isinstance(each, click.Option)]
     assert [option for option in shown if option not in page] == []
     if words not in NO_EXAMPLE and not isinstance(command, click.Group):

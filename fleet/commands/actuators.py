@@ -129,7 +129,7 @@ def servo(
 ) -> None:
     """Move a servo: left, right or reset (vertical: up, down or reset). The front servo also accepts 0 to 180 degrees.
 
-    The car turns the front servo to 180 minus the number.
+    SERVO is front, horizontal or vertical. The car turns the front servo to 180 minus the number.
     """
     carry_out(client, request, cars, take=take, as_json=as_json)
 
@@ -152,7 +152,7 @@ def arm(client: Fleet, cars_and_request: tuple[tuple[str, ...], CommandRequest],
 @json_option
 @with_client
 def speed(client: Fleet, cars: tuple[str, ...], step: str, *, take: bool, as_json: bool) -> None:
-    """Go faster or slower by one step. Cars have no absolute speed."""
+    """Go faster or slower by one step, up or down. Cars have no absolute speed."""
     carry_out(client, speed_request(step), cars, take=take, as_json=as_json)
 
 

@@ -21,7 +21,7 @@ from fleet.client.commands import (
 )
 from fleet.client.lost_hub import LostHub
 from fleet.client.outcome import NO_ANSWER, Outcome, bus_lost_words
-from fleet.commands.fleets import client_in, in_all_fleets
+from fleet.commands.fleets import client_in, stop_in_all_fleets
 from fleet.commands.options import (
     bus_options,
     carry_out,
@@ -76,7 +76,10 @@ examples:
 @json_option
 @with_client
 def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, *, take: bool, as_json: bool) -> None:
-    """Move for a time, then stop. The command waits until the car has stopped. Ctrl-C stops it earlier."""
+    """Move for a time, then stop. The command waits until the car has stopped. Ctrl-C stops it earlier.
+
+    MOTION is forward, back, left, right, spin_left or spin_right.
+    """
     named = resolve_cars(client, cars)
     with signals.sigterm_interrupts():
         try:
@@ -95,6 +98,8 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
 @with_client
 def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json: bool) -> None:
     """Make cars act by themselves. `manual` ends every other mode, and the car waits for commands.
+
+    MODE is manual, remote_control, tracking, obstacle_avoidance, color_led, light_seeking or following.
 
     To stop cars, use `fleet stop`: a running plan then leaves them alone.
     """
@@ -185,7 +190,7 @@ def _stop(
     client, hung = _client_that_stops(connect, fleet)
     with client:
         try:
-            outcomes = in_all_fleets(client, connect, words, act)
+            outcomes = stop_in_all_fleets(client, connect, words, act)
         except KeyboardInterrupt:
             click.echo(f"fleet: the stop was sent. Nothing shows yet that a car stands: look at it.{lasts}", err=True)
             raise

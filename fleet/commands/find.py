@@ -71,8 +71,8 @@ def find(
     """Find when CONDITION held, in every session in DIR (default: sessions).
 
     CONDITION is written as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is
-    unknown. A hit lasts from the first reading for which CONDITION is true to the last one. The quota does not remove
-    sessions that --mark has marked.
+    unknown. A hit lasts from the first reading for which CONDITION is true to the last one. A session that
+    --mark has marked is kept when `fleet record --quota` makes room.
     """
     if as_csv and as_json:
         raise click.UsageError("give --csv or --json, not both")

@@ -1,7 +1,10 @@
-"""Finds the fleet that a command means, if several are on one bus and the user has not named one."""
+"""Finds the fleet that a command means, if several are on one bus and the user has not named one.
+
+A stop asks nobody: it stops the cars in all fleets that it could mean.
+"""
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -17,14 +20,21 @@ from schemas.words import Rank
 
 
 def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
-    """Return the fleets that a command for these cars could mean. If at most one runs on the bus, return `fleet`."""
+    """Return the fleets that a command for these cars could mean: those with all of the cars, or if there is none, all.
+
+    If at most one fleet runs on the bus, return `fleet`. If there are several, hints name a fleet from now on.
+    """
     found = fleets_on(bus)
+    if len(found) > 1:
+        name_fleet_in_hints()
+    return _meant(found, fleet, cars)
+
+
+def _meant(found: Mapping[str, Container[str]], fleet: str, cars: Iterable[str]) -> list[str]:
     if len(found) < 2:
         return [fleet]
-    if click.get_current_context(silent=True) is not None:  # `in_all_fleets` calls this in a thread, without context
-        name_fleet_in_hints()
-    wanted = {each for each in cars if each != ALL_CARS and not each.startswith("@")}
-    return sorted(name for name, members in found.items() if wanted <= members) or sorted(found)
+    wanted = [each for each in cars if each != ALL_CARS and not each.startswith("@")]
+    return sorted(name for name in found if all(each in found[name] for each in wanted)) or sorted(found)
 
 
 def the_fleet(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> str:
@@ -85,30 +95,36 @@ def _only_fleet(bus: Bus, fleet: str, first: str) -> str:
     return fleet
 
 
-def _ambiguous(possible: Iterable[str]) -> click.UsageError:
-    return click.UsageError(f"Several fleets are on this bus: {', '.join(possible)}. Say which one with --fleet NAME.")
+def _ambiguous(possible: Sequence[str]) -> click.UsageError:
+    if len(possible) == 1:
+        return click.UsageError(
+            f"Several fleets are on this bus, and only {possible[0]} has that: add --fleet {possible[0]}."
+        )
+    return click.UsageError(f"Several fleets could be meant: {', '.join(possible)}. Say which one with --fleet NAME.")
 
 
-def in_all_fleets(
+def stop_in_all_fleets(
     client: Fleet, connect: str | None, cars: Sequence[str], act: Callable[[Fleet], Sequence[Outcome]]
 ) -> list[Outcome]:
     """Stop the cars in this client's fleet, and meanwhile those in every other fleet that the command could mean.
 
     `act` stops the cars in the fleet of a client, and returns their outcomes.
     """
-    is_explicit = is_named()
+    if is_named():
+        return list(act(client))
+    members: dict[str, set[str]] = {}
 
-    def elsewhere() -> list[Outcome]:
-        possible = [client.name] if is_explicit else candidates(client.bus, client.name, cars)
-        others = [name for name in possible if name != client.name]
+    def elsewhere() -> list[tuple[str, Outcome]]:
+        members.update(fleets_on(client.bus))
+        others = [name for name in _meant(members, client.name, cars) if name != client.name]
         if not others:
             return []
         with ThreadPoolExecutor(len(others)) as pool:
-            return [each for found in pool.map(other, others) for each in found]
+            return [(name, each) for name, found in zip(others, pool.map(other, others), strict=True) for each in found]
 
     def other(name: str) -> list[Outcome]:
         with Fleet(connect, name, sender=client.sender, kind=client.kind) as there:
-            return [replace(each, car=f"{name}/{each.car}") for each in act(there)]
+            return list(act(there))
 
     with ThreadPoolExecutor(1) as pool:
         further = pool.submit(elsewhere)
@@ -116,7 +132,12 @@ def in_all_fleets(
         found = further.result()
     if found:
         name_fleet_in_hints()
-    both = [*own, *found]
-    # A car that is in only one fleet has no answer in the others. Leave these outcomes out.
-    answered = {each.car.rpartition("/")[2] for each in both if each.phase != NO_ANSWER}
-    return [each for each in both if each.phase != NO_ANSWER or each.car.rpartition("/")[2] not in answered]
+    # A car that is only in another fleet has no answer here. Leave this outcome out, but not that of a car of this
+    # fleet that does not answer.
+    both = [*((client.name, each) for each in own), *found]
+    answered = {each.car for _, each in both if each.phase != NO_ANSWER}
+    return [
+        each if fleet == client.name else replace(each, car=f"{fleet}/{each.car}")
+        for fleet, each in both
+        if each.phase != NO_ANSWER or each.car not in answered or each.car in members.get(fleet, ())
+    ]

@@ -141,7 +141,13 @@ class _PlanGroup(CommandGroup):
     """A group that imports some of its commands when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return ["run", "set", "show", "try", *(each for each in super().list_commands(ctx) if each not in _FIRST)]
+        return [
+            "run",
+            "set",
+            "show",
+            "try",
+            *(each for each in super().list_commands(ctx) if each not in _LISTED_FIRST),
+        ]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _OWN_MODULES:
@@ -151,7 +157,7 @@ class _PlanGroup(CommandGroup):
         return command
 
 
-_FIRST: Final = ("set", "show")
+_LISTED_FIRST: Final = ("set", "show")
 
 
 @click.group(
@@ -160,7 +166,7 @@ _FIRST: Final = ("set", "show")
 examples:
   fleet up --plan plan.yaml       # run a plan with a fleet
   fleet plan set other.yaml       # change it while it runs
-  fleet plan stop                 # let go of all cars
+  fleet plan stop                 # bring its cars to rest
 
 `fleet check plan.yaml` looks for mistakes.""",
 )
@@ -219,8 +225,8 @@ def show(client: Fleet, *, as_json: bool) -> None:
     if plan.phases:
         click.echo(f"phase: {phase or '-'} (of {', '.join(plan.phases)})")
     for name, role in plan.roles.items():
-        wanted = "all" if role.count is None else role.count
-        click.echo(f"role {name} ({role.mode}): {', '.join(roles[name]) or 'no car'}, {len(roles[name])} of {wanted}")
+        wanted = "" if role.count is None else f", {len(roles[name])} of {role.count}"
+        click.echo(f"role {name} ({role.mode}): {', '.join(roles[name]) or 'no car'}{wanted}")
     for name, them in others.items():
         click.echo(f"{name}: {', '.join(them)}")
     if plan.rules:

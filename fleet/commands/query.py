@@ -24,7 +24,7 @@ examples:
   fleet query "SELECT session, car, min(range_m) FROM sensor_range GROUP BY ALL"
   fleet query "SELECT car, mode, count(*) FROM sensor_line_context GROUP BY ALL" --csv > modes.csv
 
-Exit codes: 0 done, 1 no session could be read, or no disk has room for the tables, 2 wrong use."""
+Exit codes: 0 done, 1 sessions, but none of them could be read, or no disk has room for the tables, 2 wrong use."""
 )
 @click.argument("sql", required=False, metavar="[SQL]")
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
@@ -43,9 +43,10 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     from fleet.recording.tools.table_formats import FormatMissing
 
     # With --tables there is no question, so a single argument is DIR.
-    if tables and directory is None and sql is not None and Path(sql).is_dir():
+    if tables and directory is None and sql is not None and not any(map(str.isspace, sql)):
         directory, sql = Path(sql), None
-    if (sql is None) is not tables or (as_csv and as_json):
+    has_both_or_neither = (sql is not None) == tables
+    if has_both_or_neither or (as_csv and as_json):
         raise click.UsageError("give either a question or --tables, and at most one of --csv and --json")
     place = existing_sessions_place(directory)
     text = sys.stdin.read() if sql == "-" else sql or ""
