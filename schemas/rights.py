@@ -91,7 +91,10 @@ class People(Struct, frozen=True):
 
     @classmethod
     def merged(cls, parts: Iterable["People"]) -> Self:
-        """Return the people of several cars: whoever is a lead of one is a lead of all."""
+        """Return the people of several cars: whoever is a lead of one is a lead of all.
+
+        Of the roles of one person that are not lead, the last one counts.
+        """
         listed = [each for each in parts if each.roles is not None]
         if not listed:
             return cls()
@@ -130,18 +133,21 @@ class People(Struct, frozen=True):
         return self.role(person) in (PersonRole.DRIVER, PersonRole.LEAD)
 
     def may_end(self, sender: Sender, by: str, rank: Rank) -> bool:
-        """Return True if this sender may end what `by` of this rank began. Only a lead ends what a lead began."""
+        """Return True if this sender may end what `by` of this rank began.
+
+        What a lead began, only a lead may end, as long as the table names one.
+        """
         if rank is not Rank.LEAD or sender.kind is Rank.LEAD:
             return True
         if self.roles is None:
-            # Without a table, this gateway knows only one lead: the one who began it. If another lead ends a pause or
-            # a fleet-wide e-stop at the other gateways, this gateway learns of the end from them.
+            # Without a table, this gateway knows no leads, so only the person who began it may end it here. If a lead
+            # ends a pause or a fleet-wide e-stop at the other gateways, this gateway learns of the end from them.
             return sender.kind is Rank.PERSON and sender.person == person_of(by)
         # After a restart with another table there may be no lead left. Then anyone may end it, else the car would stay
         # stopped for ever.
         return not self.leads
 
-    def may_direct(self, sender: Sender) -> "Denial | None":
+    def denies_directing(self, sender: Sender) -> "Denial | None":
         """Return why this sender may not act on the whole fleet: pause it, lend a car, change its plan.
 
         Where there are leads, only they may. Elsewhere every person of the fleet may.
@@ -212,7 +218,7 @@ class Loan(Struct, frozen=True):
     duration_s: float = inf
 
     def left_s(self, now_ns: int) -> float:
-        """Return the remaining time by the wall clock. A clock that was set back prolongs no loan."""
+        """Return the remaining time by the wall clock: `duration_s` at most, even if the clock was set back."""
         return self.duration_s - max(0.0, (now_ns - self.since_ns) / 1e9)
 
 
@@ -341,7 +347,7 @@ class Authority(Struct, frozen=True):
             LeaseState(Sender(lease.holder, rank_of(lease.kind))) if safety.HasField("lease") else None,
         )
 
-    def may(self, sender: Sender, right: Right) -> Denial | None:
+    def denies(self, sender: Sender, right: Right) -> Denial | None:
         """Return why this sender lacks the right, or None if the sender has it.
 
         `People.ranked` must have set the sender's rank.
@@ -355,36 +361,35 @@ class Authority(Struct, frozen=True):
             case Right.RESUME if sender.kind is Rank.COORDINATOR:
                 return Denial(Bar.ON_HOLD, self.hold)
             case Right.RESUME:
-                return self._held(sender) or self._may_drive_at_all(sender)
+                return self._held(sender) or self._denies_any_drive(sender)
             case Right.END_ESTOPS:
                 stays = [each for each in self.estops if not self.may_end_estop(each, sender)]
                 return self.estop_stays(stays[0], sender) if stays and len(stays) == len(self.estops) else None
             case Right.LEND:
-                return people.may_direct(sender) or self.may_drive(sender)
+                return people.denies_directing(sender) or self.denies_drive(sender)
             case Right.UNPAUSE:
-                return people.may_direct(sender) or self._pause_stays(sender)
+                return people.denies_directing(sender) or self._pause_stays(sender)
             case Right.END_LOAN if self.loan is None or self.loan.to == sender.person:
                 return None
             case _:
-                return people.may_direct(sender)
+                return people.denies_directing(sender)
 
-    def may_resume(self, sender: Sender, ids: tuple[str, ...] = (), *, every: bool = False) -> Denial | None:
-        """Return why the sender may end nothing that a resume names, or None if it may end at least a part of that.
+    def denies_resume(self, sender: Sender, ids: tuple[str, ...] = (), *, every: bool = False) -> Denial | None:
+        """Return None if the sender may end at least one of the things that a resume names, else why not.
 
         The resume names the e-stops `ids`, or without ids the hold. With `every`, it names the hold and all e-stops.
         """
-        hold = self.may(sender, Right.RESUME)
+        hold = self.denies(sender, Right.RESUME)
         if sender.kind is Rank.COORDINATOR:
             return hold
         named = [estop for estop in self.estops if every or estop.id in ids]
         stays = [estop for estop in named if not self.may_end_estop(estop, sender)]
         if len(stays) < len(named) or (ids and not named):
             return None
-        if stays and (hold is not None or self.hold is None or not every):
-            return self.estop_stays(stays[0], sender)
-        return hold
+        ends_the_hold = every and self.hold is not None and hold is None
+        return self.estop_stays(stays[0], sender) if stays and not ends_the_hold else hold
 
-    def may_drive(self, sender: Sender) -> Denial | None:
+    def denies_drive(self, sender: Sender) -> Denial | None:
         """Return why the people of the fleet or a loan keep this sender from the car."""
         person, people, loan = sender.person, self.people, self.loan
         if sender.kind is Rank.LEAD:
@@ -399,31 +404,32 @@ class Authority(Struct, frozen=True):
     def may_end_estop(self, estop: Estop, sender: Sender) -> bool:
         """Return True if the sender may end this e-stop. The coordinator ends none.
 
-        Only a lead may end a lead's e-stop. Another e-stop may be ended by the person who began it and by all who may
-        drive this car. If it is fleet-wide, every person of the fleet may end it, so that all gateways decide alike.
+        A lead's e-stop may be ended by a lead (`People.may_end`). Another one may be ended by the person who began it,
+        by the person who has borrowed this car, and by all who may drive it. If it is fleet-wide, every person of the
+        fleet may end it, so that all gateways decide alike.
         """
         people, person = self.people, sender.person
         if sender.kind is Rank.COORDINATOR or not people.may_end(sender, estop.by, estop.rank):
             return False
-        mine = person in (person_of(estop.by), self.loan and self.loan.to)
-        return mine or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
+        is_theirs = person in (person_of(estop.by), self.loan and self.loan.to)
+        return is_theirs or people.may_drive(person) or (estop.fleet_wide and people.role(person) is PersonRole.OTHER)
 
     def estop_stays(self, estop: Estop, sender: Sender) -> Denial:
         """Return why the sender may not end this e-stop."""
         if self.people.may_end(sender, estop.by, estop.rank):
-            return self._may_drive_at_all(sender) or Denial(Bar.UNLISTED)
+            return self._denies_any_drive(sender) or Denial(Bar.UNLISTED)
         return Denial(Bar.LEADS_ESTOP, estop)
 
-    def _may_drive_at_all(self, sender: Sender) -> Denial | None:
+    def _denies_any_drive(self, sender: Sender) -> Denial | None:
         """Return why the people of the fleet keep this sender from the car. Ignore a loan to another person."""
         loan = self.loan if self.loan is not None and self.loan.to == sender.person else None
-        return replace(self, loan=loan).may_drive(sender)
+        return replace(self, loan=loan).denies_drive(sender)
 
     def _kept_away(self, sender: Sender) -> Denial | None:
         """Return why an e-stop, a pause, a loan or the people of the fleet keep the sender from the car."""
         if self.estops:
             return Denial(Bar.ESTOPPED, self.estops[0])
-        denial = self.may_drive(sender)
+        denial = self.denies_drive(sender)
         if denial is not None or not self.pauses or sender.kind is Rank.LEAD:
             return denial
         return Denial(Bar.PAUSED, binding_pause(self.pauses))

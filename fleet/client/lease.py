@@ -72,7 +72,7 @@ class LeaseMonitor:
     def _denial(self, authority: Authority) -> Denial | None:
         """Return why a pause, a loan or the rank of our person keeps us from the car."""
         # A hold may be older than our lease, and then it has not ended the lease.
-        return replace(authority, hold=None).may(authority.people.ranked(self._sender), Right.ACT)
+        return replace(authority, hold=None).denies(authority.people.ranked(self._sender), Right.ACT)
 
     def on_outcome(self, outcome: Outcome) -> None:
         """Handle the outcome of a command of ours."""

@@ -19,7 +19,7 @@ def refusals(car: str, authority: Authority, sender: str) -> dict[Right, str]:
     """
     people = authority.people
     ranked = people.ranked(Sender(sender, Rank.PERSON))
-    denials = {right: authority.may(ranked, right) for right in Right}
+    denials = {right: authority.denies(ranked, right) for right in Right}
     return {right: describe(each, ranked, people, car) for right, each in denials.items() if each is not None}
 
 
@@ -56,7 +56,7 @@ def guest_rights(cars: Iterable[str]) -> dict[str, Any]:
 
 
 def _is_mine(authority: Authority, sender: str) -> bool:
-    return authority.may_drive(authority.people.ranked(Sender(sender, Rank.PERSON))) is None
+    return authority.denies_drive(authority.people.ranked(Sender(sender, Rank.PERSON))) is None
 
 
 def _common(by_car: Mapping[str, Mapping[Right, str]], right: Right) -> Iterator[str]:

@@ -45,5 +45,5 @@ def describe(denial: Denial, sender: Sender, people: People, car: str) -> str:
 def fleet_refusal(people: People, person: str) -> str:
     """Return why a person may not change the plan or recorder of the whole fleet, or an empty text if they may."""
     sender = people.ranked(Sender(person, Rank.PERSON))
-    denial = people.may_direct(sender)
+    denial = people.denies_directing(sender)
     return "" if denial is None else describe(denial, sender, people, "")

@@ -333,7 +333,7 @@ class Controller(Generic[D_co]):
             count = len(ended) if resume.all else len(named)
             parts.append("e-stop released" if count == 1 else f"{count} e-stops released")
         hold = safety.hold
-        if not resume.ids and authority.may(sender, Right.RESUME) is None:
+        if not resume.ids and authority.denies(sender, Right.RESUME) is None:
             parts.append(f"resumed: the hold by {name_of(hold.by)} has ended" if hold else "resumed: was not on hold")
             self._end_hold(sender, now)
         if safety.estops:
@@ -409,7 +409,7 @@ class Controller(Generic[D_co]):
             for estop in estops
         ]
         words, them = f"still emergency-stopped {', '.join(each)}", "them" if several else "it"
-        if self.authority_at(now).may(sender, Right.END_ESTOPS) is not None:
+        if self.authority_at(now).denies(sender, Right.END_ESTOPS) is not None:
             return f"{words}. {sender.person} cannot release {them}"
         return f"{words}. Release {them} with `fleet resume {self.car} --estops`"
 

@@ -101,7 +101,7 @@ TABLE: Final[dict[type[Action], Needs]] = {
     SetMode: Needs(Right.MOVE, battery=True),
     Find: _ACTS,
 }
-"""Needs of each action that is not a `PartAction`. `Authority.may_resume` decides who may end which e-stop and hold."""
+"""Needs of each action that is not a `PartAction`. Who may end which e-stop or hold is in `Authority.denies_resume`."""
 
 Refusal = tuple[Reason, str]
 
@@ -171,7 +171,7 @@ def _resume(resume: Resume, sender: Sender, context: CommandContext) -> Refusal 
     if unknown and sender.kind is not Rank.COORDINATOR:
         there = f"In force: {', '.join(in_force)}." if in_force else "None is in force."
         return Reason.BAD_VALUE, f"{car} has no e-stop {', '.join(resume.ids)}. {there}"
-    denial = authority.may_resume(sender, resume.ids, every=resume.all)
+    denial = authority.denies_resume(sender, resume.ids, every=resume.all)
     return None if denial is None else _refusal(denial, sender, context, Right.RESUME)
 
 
@@ -181,7 +181,7 @@ def _unmet(command: Command, needed: Needs, context: CommandContext) -> Refusal 
     if right is not None:
         if right is Right.MOVE and command.take:
             right = Right.TAKE
-        denial = context.authority.may(command.sender, right)
+        denial = context.authority.denies(command.sender, right)
         if denial is not None:
             return _refusal(denial, command.sender, context, right)
     if needed.battery and context.battery:

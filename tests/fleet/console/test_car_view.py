@@ -245,7 +245,7 @@ def test_binding_pause_is_shown(ranks: tuple[str, ...]) -> None:
     (car,) = view.as_list(1.0)
     at = ranks.index("lead")
     assert car["pause"] == {"by": f"lead@x-{at}", "why": f"lead {at}"}
-    denied = view.authority["red"].may(Sender("mia", Rank.PERSON), Right.MOVE)
+    denied = view.authority["red"].denies(Sender("mia", Rank.PERSON), Right.MOVE)
     assert denied is not None
     assert denied.mark == view.authority["red"].pauses[at]
 

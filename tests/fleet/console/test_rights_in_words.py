@@ -106,7 +106,7 @@ def test_page_shows_what_the_gateway_decides() -> None:
             sender = authority.people.ranked(Sender(name, PERSON))
             refused = refusals_shown("red", authority, name)
             for right, actions in asked.items():
-                denial = authority.may(sender, right)
+                denial = authority.denies(sender, right)
                 code = None if denial is None else str(denial.reason)
                 assert (right in refused) is (denial is not None)
                 for action in actions:
