@@ -1,6 +1,7 @@
 """A condition on the messages that a key expression can match, such as `range_m < 0.3` for `*/sensor/range`.
 
-The condition is checked before the first query. Unknown fields and conditions that can never hold are errors.
+The condition is checked before anything is asked on the bus. Unknown fields are errors, and so are conditions that can
+never hold.
 """
 
 from collections.abc import Mapping
@@ -26,7 +27,7 @@ _SERVICES: Final = {topic.family for topic in topics.SERVICE_TOPICS}
 
 
 def topics_under(key_expression: str) -> list[topics.Topic]:
-    """Return the topics that a key expression can match, in the table's order."""
+    """Return the topics that a key expression can match, in the order of `topics.TOPICS`."""
     return [topic for topic in topics.TOPICS.values() if intersects(key_expression, _PATTERNS[topic.name])]
 
 
@@ -97,7 +98,7 @@ class KeyCondition(Struct, frozen=True):
         return self.text
 
     def holds(self, reading: Reading) -> bool | None:
-        """Return True if the condition holds for this reading. None if a field is missing or was not measured."""
+        """Return True if the condition holds for this reading. None if a missing value leaves that open."""
         expression = self.by_message.get(reading.value.DESCRIPTOR.full_name)
         return None if expression is None else expression.value(compared_in(reading.value))
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from schemas.keys import DEFAULT_FLEET
 
-WITHOUT_BUS: Final = frozenset(
+WITHOUT_FLEET: Final = frozenset(
     (
         "bind",
         "check",
@@ -55,9 +55,9 @@ def complete_hints(words: str, options: str) -> str:
 def complete_command(command: str, options: str) -> str:
     """Add the options to a command such as `fleet stop red`.
 
-    A command that accepts no such option, or already has one, is returned unchanged.
+    A command that does not accept --fleet, or already has one of the options, is returned unchanged.
     """
     _, verb, *arguments = command.split()
-    has_no_bus = verb in WITHOUT_BUS or f"{verb} {arguments[0] if arguments else ''}" in WITHOUT_BUS
+    names_no_fleet = verb in WITHOUT_FLEET or f"{verb} {arguments[0] if arguments else ''}" in WITHOUT_FLEET
     has_one = any(word.startswith("--") and word in arguments for word in options.split())
-    return command if has_no_bus or has_one or not options else f"{command} {options}"
+    return command if names_no_fleet or has_one or not options else f"{command} {options}"

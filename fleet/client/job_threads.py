@@ -1,4 +1,4 @@
-"""Threads that end with their jobs. `ThreadPoolExecutor` keeps every thread that it ever started."""
+"""Threads that end when no job waits. `ThreadPoolExecutor` keeps every thread that it ever started."""
 
 import threading
 from collections import deque
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class JobThreads:
-    """Runs each job on a thread of its own, at once. Jobs over the limit wait for the first thread that is free.
+    """Starts a thread for each job, up to a limit. Further jobs wait for the first thread that is free.
 
     Many jobs at once cost threads and memory only while they run.
 

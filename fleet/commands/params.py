@@ -54,7 +54,7 @@ class Duration(click.ParamType[float]):
 
 
 class Since(click.ParamType[float]):
-    """A time in the past: how long ago (`30s`, `-5m`), a local time of day (`14:05`), or a date."""
+    """A time in the past: how long ago (`30s`, `-5m`), a local time (`14:05`, `yesterday 14:05`), a day, or a date."""
 
     name = "TIME"
 
@@ -350,14 +350,18 @@ def expand_key(keyexpr: str, fleet: str) -> str:
 
 
 def no_cars(client: Fleet) -> click.ClickException:
-    """Return the error that no car is connected. It names the other fleets if this fleet is not on the bus."""
+    """Return the error that no car is connected.
+
+    It names the other fleets if this fleet is not on the bus, or says why the hub passes nothing on, or names a hub
+    that has just started.
+    """
     if others := describe_other_fleets(client):
         return click.ClickException(others)
     if refused := why_refused(client):
         return click.ClickException(refused)
     words = "No car is connected."
     if running := describe_running(client.bus.endpoint):  # gateways may be about to reconnect to a restarted hub
-        words = f"No car is connected, but {running}. Repeat this in a few seconds. Otherwise go to the cars."
+        words = f"No car is connected, but {running}. Repeat this in a few seconds. If it fails again, go to the cars."
     return click.ClickException(words)
 
 

@@ -73,7 +73,7 @@ def replay(
 
 
 def check_target(save: Path, segments: Iterable[Path] = ()) -> None:
-    """Raise a UsageError for a target that is a recording, a device, or no .rrd file."""
+    """Raise a UsageError for a target that is the recording itself, no regular file, or not named .rrd."""
     if save.suffix != ".rrd":
         raise click.UsageError(
             f"--save {save}: Rerun opens only files that end in .rrd: name it {save.stem.strip('.') or 'out'}.rrd"
@@ -107,7 +107,7 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
     from fleet.replay.rerun.rrd_export import ExportFailed, export
 
     try:
-        # Rerun calls Python for each chunk, and may lose an exception there. So Ctrl-C is noticed between two.
+        # Rerun calls Python for each chunk, and may lose an exception there. So Ctrl-C takes effect between two chunks.
         with _progress_bar(session) as advance, signals.held_back() as came:
 
             def on_read(messages: int) -> None:

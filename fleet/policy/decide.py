@@ -5,14 +5,14 @@ cars were always connected, readings always fresh, and nobody else drove. But li
 people drive. So most of this module is about *not* acting.
 
 First: whose car is it? The coordinator has the lowest rank. A car is left alone, whatever the plan says, if a person
-holds, drives, has paused or borrowed it, or if it cannot be reached. This module calls such a reason a *barrier*. Each
-barrier has a sentence for the person who asks why nothing happens. A car that is out of reach keeps its role for a
-while, because links come back within seconds. A role that is vacant for a moment is better than a fleet that reshuffles
-at every hiccup of a radio.
+holds, drives, has paused or borrowed it, if an e-stop is in force, or if it cannot be reached or is not in a known
+state. This module calls such a reason a *barrier*. Each barrier has a sentence for the person who asks why nothing
+happens. A car that is out of reach keeps its role for a while, because links come back within seconds. A role that is
+vacant for a moment is better than a fleet whose roles change at every short loss of a link.
 
 Second: what is true? Rules are evaluated in every step. But a rule comes into force only when its condition has been
 true for a time, and ends only when it has not been true for a time (`debounce`, `rules`). A comparison with a value
-that was not measured is unknown, and unknown does not count as true: nothing is done because of something that nobody
+that was not measured is unknown, and unknown does not count as true: no rule begins because of something that nobody
 has seen.
 
 Third: who gets which role? That is a small assignment problem (`role_allocation`). Filled roles of high priority count
@@ -486,7 +486,7 @@ def _command_leds(
             if not state.on or effect.led is None or effect.blink_s is not None:
                 continue
             of_any_car = LedRequest(index, position, state.trigger, None)
-            if of_any_car in memory.led_requests:  # before a restart, the coordinator has set this color
+            if of_any_car in memory.led_requests:  # it was set before the coordinator restarted
                 result.add(of_any_car)
                 continue
             for car in targets(effect, state, subjects, allocation.roles):

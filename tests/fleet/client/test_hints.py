@@ -4,7 +4,7 @@ import click
 import pytest
 
 from fleet.cli import cli
-from fleet.client.hints import WITHOUT_BUS, complete_command, complete_hints
+from fleet.client.hints import WITHOUT_FLEET, complete_command, complete_hints
 
 TWO = "--connect tcp/10.0.0.2:7447 --fleet two"
 
@@ -44,4 +44,4 @@ def test_exactly_the_commands_without_the_option_get_none() -> None:
             return {path[0]} if whole and path else set().union(*inner)
         return set() if any(each.name == "fleet" for each in command.params) else {" ".join(path)}
 
-    assert without(cli, ()) == WITHOUT_BUS
+    assert without(cli, ()) == WITHOUT_FLEET
