@@ -34,7 +34,7 @@ class CommandType(NamedTuple):
     verb: Verb
     about: str
     effect: str = ""
-    """Text of the outcome when the frames of the command were sent. Empty if `fleet.client.effects` has its texts."""
+    """Text of the outcome when the frames of the command were sent. Empty if `outcome_words` has its texts."""
     ttl_s: float = 2.0
     """Default of the maximum age at arrival (docs/reference/commands.md#payload)."""
     wildcard: bool = False

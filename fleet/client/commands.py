@@ -11,8 +11,8 @@ from typing import Any, Final, Generic, TypeVar
 
 from msgspec import Struct
 
-from fleet.client.effects import ESTOP_FLEET, RELEASE
 from fleet.client.outcome import Until
+from fleet.client.outcome_words import ESTOP_FLEET, RELEASE
 from schemas import keys, messages
 from schemas.commands import COMMANDS, Verb
 from schemas.gen import fleet_v1_pb2 as pb

@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import Final, Self
 
 from fleet.client.claims import NOT_STOPPED
-from fleet.client.effects import NEXT_STEPS, STOP_VERBS, UNCONFIRMED, describe, with_code
+from fleet.client.outcome_words import NEXT_STEPS, STOP_VERBS, UNCONFIRMED, describe, with_code
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S, MAX_QUEUE_TIME_S
 from schemas.suggestion import did_you_mean
 from schemas.words import Basis, Phase, Reason

@@ -31,7 +31,6 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import Decision, DecisionKind
 from fleet.policy.explain import (
     Override,
@@ -51,7 +50,16 @@ from fleet.policy.explain import (
     is_reworded,
 )
 from fleet.policy.plan.plan import Effect, Plan, Rule
-from fleet.policy.role_allocation import Barrier, Candidates, PinnedRole, RoleAllocation, allocate, follow_needs
+from fleet.policy.role_allocation import (
+    ROLE_KEPT_S,
+    Barrier,
+    Candidates,
+    PinnedRole,
+    RoleAllocation,
+    allocate,
+    follow_needs,
+    reserved_roles,
+)
 from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import (
@@ -106,13 +114,9 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     if memory.stopped_by:
         return _step_stopped(plan, snapshot, subjects, barriers, memory, now)
     gone_since = {car: memory.gone_since.get(car, now) for car in barriers}
-    gone_lately = {car for car, since in gone_since.items() if now - since < HYSTERESIS_S}
+    gone_lately = {car for car, since in gone_since.items() if now - since < ROLE_KEPT_S}
     roles_before = memory.roles
-    reserved = {
-        car: roles_before[car]
-        for car, barrier in barriers.items()
-        if not barrier.ends_role and car in roles_before and car in gone_lately
-    }
+    reserved = reserved_roles(roles_before, barriers, gone_lately)
     free = tuple(car for car in subjects if car not in barriers)
     cars = CarSets(subjects, frozenset(free), frozenset({*free, *gone_lately}), roles_before)
     phase = memory.phase
@@ -152,7 +156,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     for car in subjects:
         if car in barriers:
             # `on_hub_back` sets a time in the future: its longer grace period applies until that time has come.
-            kept_s = HYSTERESIS_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
+            kept_s = ROLE_KEPT_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
             decisions.append(explain_alone(car, barriers[car], reserved.get(car), kept_s))
         elif car in overrides:
             decisions.append(explain_rule(car, overrides[car], allocation.roles.get(car)))

@@ -5,19 +5,21 @@ changes of mode; the order in the plan. Within one priority, the places of a rol
 of a role for all cars.
 """
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Final, NamedTuple
 
 from msgspec import Struct
 
 from fleet.conditions import Expression
-from fleet.policy.debounce import Settled, settle
+from fleet.policy.debounce import HYSTERESIS_S, Settled, settle
 from fleet.policy.min_cost_matching import assign
 from fleet.policy.plan.plan import Plan, Role
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from schemas.platform_name import kind_of
 from schemas.words import LinkState, Reason, Verdict
 
+ROLE_KEPT_S: Final = HYSTERESIS_S
+"""Time for which a car that cannot be reached keeps its role. Then another car gets the role."""
 REFUSED_MODE_RETRY_S: Final = 10.0
 """Delay before the next request of a mode that a car refused."""
 _REFUSALS: Final = frozenset({Reason.BATTERY_LOW, Reason.UNSUPPORTED, Reason.LINK_DOWN, Reason.WRITE_FAILED})
@@ -40,6 +42,16 @@ class Barrier(Struct, frozen=True):
     """The expression from which the barrier follows."""
     ends_role: bool = False
     """True if a person has taken the car for a longer time, so that the car loses its role at once."""
+
+
+def reserved_roles(roles: Mapping[str, str], barriers: Mapping[str, Barrier], lately: Container[str]) -> dict[str, str]:
+    """Return the role of each car that cannot be commanded and still keeps it.
+
+    `roles` are those before this step, and `lately` the cars whose barrier began within ROLE_KEPT_S.
+    """
+    return {
+        car: roles[car] for car, barrier in barriers.items() if not barrier.ends_role and car in roles and car in lately
+    }
 
 
 class PinnedRole(NamedTuple):

@@ -6,9 +6,10 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from fleet.policy.debounce import HYSTERESIS_S, Debounced, Settled
+from fleet.policy.debounce import Debounced, Settled
 from fleet.policy.decision import Decision
 from fleet.policy.plan.plan import Plan
+from fleet.policy.role_allocation import ROLE_KEPT_S
 from fleet.policy.rules import PhaseState, RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
 from schemas.backoff import backoff_s
@@ -116,7 +117,7 @@ class PolicyState(Struct, frozen=True):
 
 def on_hub_back(memory: PolicyState, now: float) -> PolicyState:
     """Return the state for the time after a hub is back. No car loses its role by an outage of the hub."""
-    return replace(memory, gone_since=dict.fromkeys(memory.held_roles, now + HUB_RETURN_GRACE_S - HYSTERESIS_S))
+    return replace(memory, gone_since=dict.fromkeys(memory.held_roles, now + HUB_RETURN_GRACE_S - ROLE_KEPT_S))
 
 
 def carry_over(memory: PolicyState, before: Plan, after: Plan) -> PolicyState:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from gateway import capture
 from gateway.control.driver import Rejected
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
@@ -150,7 +150,7 @@ class MonitorOutput:
     def __init__(self, profile: Profile, *, as_json: bool) -> None:
         self._profile = profile
         self._as_json = as_json
-        self._decoder = Decoder(head=profile.dialect.head)
+        self._decoder = FrameSplitter(head=profile.dialect.head)
         self._paint = cli_support.Paint(sys.stdout)
         self.statistics = LinkStatistics()
 

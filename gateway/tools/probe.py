@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from msgspec import Struct, field
 
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import encode
 from gateway.drivers.yahboom.protocol.modes import candidate_modes
 from gateway.drivers.yahboom.protocol.platforms import Profile
@@ -32,7 +32,7 @@ class LinkProbe(Struct):
     probed: bool = False
     answered: bool = False
     """True after a reading of mode 0. If the link was probed, only readings after the probe's last frame count."""
-    _decoder: Decoder = field(default_factory=Decoder)
+    _decoder: FrameSplitter = field(default_factory=FrameSplitter)
     _profile: Profile = field(default_factory=lambda: cli_support.profile_of(Platform.UNKNOWN))
 
     async def open(self) -> None:

@@ -3,7 +3,7 @@
 import re
 from time import perf_counter
 
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from tests.bench.measured import Measured, Scale, in_turns
 
@@ -14,7 +14,7 @@ SIX = re.compile(rb"\$4WD,CSB([0-9.]+),PV([0-9.]+),GS([0-9]+),LF([01]{4}),HW([01
 
 
 def _ours(frames: list[bytes]) -> float:
-    feed = Decoder().feed
+    feed = FrameSplitter().feed
     began = perf_counter()
     for frame in frames:
         feed(frame, 0.0)

@@ -33,7 +33,7 @@ from gateway.control.commands import (
     Unpause,
 )
 from gateway.control.control_output import CommandRecord, OutgoingFrame
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen, Reset
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.commands import Verb
@@ -138,7 +138,7 @@ class Wild:
             now=self.now,
             now_ns=int(self.now * 1e9),
         )
-        self.decoder = Decoder()
+        self.decoder = FrameSplitter()
         self.linked = False
         self.ending = False
         self.doubted = False
@@ -246,7 +246,7 @@ class Wild:
         if self.linked:
             self.control.driver.link_down("unplugged", self.now)
         else:
-            self.decoder = Decoder()
+            self.decoder = FrameSplitter()
             self.control.link_up(self.now)
             self.free_at = self.now
         self.linked = not self.linked
@@ -383,7 +383,7 @@ def until_off(control: Control, now: float) -> CommandRecord | None:
         now = min(control.driver.next_at(now), report_at)
         if now >= report_at:
             report_at = now + 1.0
-            for event in Decoder().feed(PI if pi else MANUAL, now):
+            for event in FrameSplitter().feed(PI if pi else MANUAL, now):
                 control.driver.on_event(event, now)
             control.tick(now)
     return last

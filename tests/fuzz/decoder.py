@@ -3,7 +3,7 @@
 import random
 
 from gateway.control.driver import Echo, Rejected
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from tests.fuzz.controller import MANUAL, READINGS
 
@@ -33,7 +33,7 @@ def piece(moments: random.Random) -> bytes:
 def run(seed: int, pieces: int) -> int:
     """Feed `pieces` pieces. Return the number of events that they made."""
     moments = random.Random(seed)
-    decoder, now, made = Decoder(), 0.0, 0
+    decoder, now, made = FrameSplitter(), 0.0, 0
     for number in range(pieces):
         try:
             now += moments.choice((0.0, 0.0, 0.001, 0.02, 0.049, 0.051, 3.0, 1e6 if number % 5000 == 0 else 0.5))
@@ -54,7 +54,7 @@ def run(seed: int, pieces: int) -> int:
                 assert isinstance(event, Sensors)
                 assert event.raw == MANUAL
                 assert all(isinstance(event, Sensors | Rejected | Echo) or event.raw for event in decoder.end())
-                decoder = Decoder()
+                decoder = FrameSplitter()
         except Exception as error:
             error.add_note(f"seed {seed}, piece {number}")
             raise

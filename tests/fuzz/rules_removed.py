@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gateway.drivers.yahboom.estimate.mode import ModeEstimator
-from gateway.drivers.yahboom.protocol import decoder
+from gateway.drivers.yahboom.protocol import frame_splitter
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.stop_executor import StopExecutor
 from gateway.drivers.yahboom.stop_renewal import StopRenewal
@@ -45,7 +45,7 @@ def _damaged_frames_count(patch: Patch) -> None:
 
 
 def _frames_continue_after_a_silence(patch: Patch) -> None:
-    patch(decoder, "CUT_FRAME_SILENCE_S", float("inf"))
+    patch(frame_splitter, "CUT_FRAME_SILENCE_S", float("inf"))
 
 
 def _any_report_shows_that_a_mode_was_left(patch: Patch) -> None:

@@ -20,7 +20,7 @@ from gateway.control.control_output import CommandRecord
 from gateway.control.driver import TICK_S
 from gateway.drivers.yahboom.estimate.learned import KEPT_INTERVALS, Learned
 from gateway.drivers.yahboom.estimate.mode import MAX_FADE_EXCUSE_S
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.stops.stop_in_progress import EVIDENCE_INTERVALS, evidence_s
 from gateway.sim.model.arduino import ArduinoCar
@@ -501,7 +501,7 @@ class Episode:
         is_known = plan.kept and plan.platform == "arduino" and plan.traits.readings
         learned = learned_of(plan.traits, random.Random(f"learned {plan.seed}")) if is_known else None
         self.control = control(parse_platform(plan.told), learned=learned)
-        self.decoder = Decoder()
+        self.decoder = FrameSplitter()
         self.now = 0.0
         self.zero = float("inf")
         """Time of the stop."""
@@ -653,7 +653,7 @@ class Episode:
     def _connect(self) -> None:
         if isinstance(self.car, RaspberryPiCar):
             self.car.connected(self.now)
-        self.decoder = Decoder()
+        self.decoder = FrameSplitter()
         self._linked = True
         self.control.link_up(self.now)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.driver import TICK_S
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build
 from gateway.sim.model.firmware import Firmware
@@ -53,7 +53,7 @@ class Pair:
         )
         self.transport = transport
         self.control = control(parse_platform(told or platform), name=name)
-        self.decoder = Decoder()
+        self.decoder = FrameSplitter()
         self.sent: list[tuple[float, bytes]] = []
         self.records: list[CommandRecord] = []
         self.logs: list[LogRecord] = []
@@ -77,7 +77,7 @@ class Pair:
         """Open the link, so that recovery begins."""
         if isinstance(self.car, RaspberryPiCar):
             self.car.connected(self.now)
-        self.decoder = Decoder()
+        self.decoder = FrameSplitter()
         self.control.link_up(self.now)
 
     def lose(self, reason: str = "unplugged") -> None:

@@ -1,7 +1,7 @@
 // The page's side of the one WebSocket: the newest state, presses, STOP, commands and their outcomes.
 
 import { parse, seen } from "./foreign.js";
-import { motionOf } from "./holds.js";
+import { motionOf } from "./held-motion.js";
 import { placed } from "./places.js";
 import { clockAt, dayWords } from "./when.js";
 

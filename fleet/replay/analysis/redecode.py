@@ -15,7 +15,7 @@ from msgspec import Struct, field
 
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
 from gateway import drivers
-from gateway.drivers.yahboom.protocol.decoder import ECHO_S, MAX_FRAME, Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import ECHO_S, MAX_FRAME, FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import STANDARD_HEAD
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
@@ -70,7 +70,7 @@ class Redecoding(Struct):
     car: str
     platform: str | None = None
     counts: Counts = field(default_factory=Counts)
-    _decoder: Decoder = field(default_factory=Decoder)
+    _decoder: FrameSplitter = field(default_factory=FrameSplitter)
     _head: str = STANDARD_HEAD
     _waiting: deque[Rx] = field(default_factory=deque)
     _sent: deque[Tx] = field(default_factory=deque)
@@ -117,7 +117,7 @@ class Redecoding(Struct):
         at = (frame.at_ns - self._began_ns) / 1e9
         profiles = self._profiles(frame.at_ns)
         if (head := profiles[0].dialect.head) != self._head:
-            self._decoder, self._head = Decoder(head=head), head
+            self._decoder, self._head = FrameSplitter(head=head), head
         while self._sent and self._sent[0].at_ns <= frame.at_ns + _MAX_ECHO_LEAD_NS:
             sent = self._sent.popleft()
             self._decoder.sent(sent.data, (sent.at_ns - self._began_ns) / 1e9)
@@ -165,7 +165,7 @@ def _around(states: deque[Any], at_ns: int, late_ns: int) -> list[Any]:
     return [state for number, state in enumerate(states) if not number or state.at_ns <= at_ns + late_ns]
 
 
-def _decode(decoder: Decoder, data: bytes, at: float) -> list[tuple[Event, ...]]:
+def _decode(decoder: FrameSplitter, data: bytes, at: float) -> list[tuple[Event, ...]]:
     """Return the events of a frame.
 
     If it has no # at its end, return the events of each way in which it may have ended.

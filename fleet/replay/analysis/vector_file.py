@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from fleet.recording import time_spec
 from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
-from gateway.drivers.yahboom.protocol.decoder import ECHO_S
+from gateway.drivers.yahboom.protocol.frame_splitter import ECHO_S
 from schemas.words import Mode
 
 ENDING: Final = ".jsonl"

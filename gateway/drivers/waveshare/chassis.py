@@ -1,19 +1,12 @@
 """The platforms of the family, by their firmware. docs/reference/waveshare.md has the source of each number."""
 
-from enum import StrEnum
 from typing import Final
 
 from msgspec import Struct
 
 from gateway.drivers.plain_profile import PlainProfile
+from gateway.drivers.waveshare.firmware import UgvFirmware
 from schemas.words import Light
-
-
-class UgvFirmware(StrEnum):
-    """The two programs of these cars. They have the same commands, but need different care to be safe."""
-
-    GENERAL = "ugv_base_general"
-    ROS = "ugv_base_ros"
 
 
 class Chassis(Struct, frozen=True):

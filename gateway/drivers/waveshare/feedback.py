@@ -11,14 +11,13 @@ from typing import Any, Final
 from msgspec import Struct
 
 from gateway.control.driver import Event, Rejected, TextLine
-from gateway.drivers.waveshare.chassis import UgvFirmware
+from gateway.drivers.waveshare.firmware import MAX_V, UgvFirmware, firmware_of
 from schemas.words import Cause
 
 FEEDBACK: Final = 1001
 """Value of `T` in a feedback."""
 MAX_M_S: Final = 5.0
-MAX_V: Final = 13.0
-"""Maximum speed of a wheel, and maximum voltage of three cells. A greater number is not a measurement."""
+"""Maximum speed of a wheel. A greater number is not a measurement."""
 _IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 _OF_ARM: Final = frozenset({"torB", "torS", "torE", "torH"})
 """Fields that only a car with an arm sends. Such a car sends positions of the arm in the fields of the yaw or the
@@ -77,7 +76,7 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
         return Rejected(raw, at, Cause.BAD_NUMBER if "L" in found and "R" in found else Cause.MISSING_WORD)
     if max(abs(left), abs(right)) > MAX_M_S:
         return Rejected(raw, at, Cause.OUT_OF_RANGE)
-    firmware = _firmware(found)
+    firmware = firmware_of(found, _number(found, "v") or 0.0)
     has_arm = not _OF_ARM.isdisjoint(found)
     return Feedback(
         raw,
@@ -90,19 +89,6 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
         _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None,
         _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS and not has_arm else None,
     )
-
-
-def _firmware(found: dict[str, Any]) -> UgvFirmware | None:
-    """Return the firmware that reports like this: GENERAL has a temperature, ROS has the distance of the wheels.
-
-    A variant may lack that field. Then angles and volts show GENERAL, a gyroscope and hundredths of a volt show ROS.
-    """
-    volts = _number(found, "v") or 0.0
-    is_general = "temp" in found or ({"r", "p", "y"} <= found.keys() and 0.0 < volts <= MAX_V)
-    is_ros = "odl" in found or "odr" in found or ("gx" in found and volts > 100.0)
-    if is_general is is_ros:
-        return None
-    return UgvFirmware.GENERAL if is_general else UgvFirmware.ROS
 
 
 def _voltage(found: dict[str, Any], firmware: UgvFirmware | None) -> float | None:

@@ -29,7 +29,7 @@ from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.car_monitor import CarMonitor
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.executor import Executor
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile
@@ -49,7 +49,7 @@ class YahboomDriver(Executor):
         """Make the driver of one car. With `auto`, it detects the platform; `profile` is then the unknown one."""
         super().__init__(desk, CarModel(desk.car, profile, auto, desk.log, desk.battery_policy, learned or Learned()))
         self._monitor = CarMonitor(self.model, self, desk.log)
-        self._decoder = Decoder(head=profile.dialect.head)
+        self._decoder = FrameSplitter(head=profile.dialect.head)
 
     @property
     def lost_frames(self) -> int:
@@ -97,7 +97,7 @@ class YahboomDriver(Executor):
     def link_up(self, now: float) -> None:
         """Begin to bring the car to a known state, because the link is open."""
         self._monitor.link_up()
-        self._decoder = Decoder(head=self.model.profile.dialect.head)
+        self._decoder = FrameSplitter(head=self.model.profile.dialect.head)
         super().link_up(now)
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:

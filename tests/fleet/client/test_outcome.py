@@ -8,8 +8,8 @@ import pytest
 from fleet.client import command_tracker
 from fleet.client.command_tracker import PendingCommand, QueryEnded
 from fleet.client.commands import mode_request, resume_request
-from fleet.client.effects import EFFECTS, STOP_VERBS
 from fleet.client.outcome import Progress, Until
+from fleet.client.outcome_words import EFFECTS, STOP_VERBS
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S, MAX_QUEUE_TIME_S

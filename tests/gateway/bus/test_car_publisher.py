@@ -13,7 +13,7 @@ from gateway.control.commands import Command, Drive, Find, SetMode, Stop
 from gateway.control.control_output import CommandRecord
 from gateway.control.link_health import LinkHealth
 from gateway.drivers.yahboom.estimate.platform import PlatformDetector
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.wire_events import ImuReading
 from schemas import keys, messages
@@ -112,7 +112,7 @@ def test_platform_contradictions_are_published(published: Published) -> None:
     told = PlatformDetector(parse_platform("raspberry_pi"))
     assert published.told_health(told)["platform_contradictions"] == []
     for _ in range(3):
-        for event in Decoder().feed(READING, 0.0):
+        for event in FrameSplitter().feed(READING, 0.0):
             told.on_event(event)
     words = list(told.contradictions)
     assert words

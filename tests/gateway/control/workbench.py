@@ -6,7 +6,7 @@ from gateway.control.commands import Action, Answer, Command
 from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.driver import TICK_S
 from gateway.control.holds_and_leases import PersistedSafety
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import FRAME_S
@@ -117,7 +117,7 @@ class Workbench:
         self._hear(frame or self.car.reading)
 
     def _hear(self, frame: bytes) -> None:
-        for event in Decoder().feed(frame, self.now):
+        for event in FrameSplitter().feed(frame, self.now):
             self.control.driver.on_event(event, self.now)
         self.pump()
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.link import Busy, CannotOpen, Link, LinkLost, open_link
 from gateway.link.tcp import TcpLink
@@ -123,7 +123,7 @@ async def test_lossy_and_noisy(link: Link, peer: Peer) -> None:
         whole += 1
     received = await read(link, len(sent))
     assert received == sent
-    decoder = Decoder()
+    decoder = FrameSplitter()
     events = [event for at in range(0, len(received), 20) for event in decoder.feed(received[at : at + 20], 1.0)]
     assert len([event for event in events if isinstance(event, Sensors)]) >= whole
 

@@ -1,6 +1,6 @@
 """Parses one whole frame from the car into its reading, or into the cause of its rejection.
 
-`decoder` finds the frames in a stream.
+`frame_splitter` finds the frames in a stream.
 """
 
 import re

@@ -149,7 +149,7 @@ class Profile(Struct, frozen=True, dict=True):
 
     @cached_property
     def dialect(self) -> Dialect:
-        """The spelling of the car's frames, for `Decoder` and `encode`."""
+        """The spelling of the car's frames, for `FrameSplitter` and `encode`."""
         head = next((option.partition("=")[2] for option in self.options if option.startswith(HEAD)), STANDARD_HEAD)
         return Dialect(head, swaps_green_and_blue=self.kind is Platform.STM32)
 

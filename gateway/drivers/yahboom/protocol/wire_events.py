@@ -1,4 +1,4 @@
-"""The events of the decoder, one class each.
+"""The events of the frame splitter, one class each.
 
 `Sensors`, the event of a sensors frame, is in `sensors`. `Echo`, `Rejected` and `TextLine`, which every family of cars
 has, are in `gateway.control.driver`. Everything that depends on the platform is in `platforms`.

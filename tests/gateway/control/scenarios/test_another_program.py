@@ -9,7 +9,7 @@ import pytest
 from gateway.control.commands import Drive, SetMode, Stop
 from gateway.drivers.yahboom.estimate.learned import REACTED, Learned
 from gateway.drivers.yahboom.estimate.platform import OTHER_PROGRAM_FRAMES
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.traits import CarTraits
 from schemas.platform_name import parse_option
@@ -272,7 +272,7 @@ def test_new_frame_head_is_used_at_once() -> None:
     pair.decoder.use_head("TANK")
     pair.control.link_up(pair.now)
     began = pair.now
-    pair.decoder = Decoder(head="TANK")
+    pair.decoder = FrameSplitter(head="TANK")
     pair.until(lambda: pair.control.driver.model.profile.dialect.head == "4WD", 3.0)
     pair.until(lambda: pair.car.truth.mode is Mode.MANUAL, began + 6.0 - pair.now)
     assert not pair.car.truth.driving

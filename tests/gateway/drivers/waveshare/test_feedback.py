@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.driver import Rejected, TextLine
-from gateway.drivers.waveshare.chassis import UgvFirmware
 from gateway.drivers.waveshare.feedback import Feedback, read_line
+from gateway.drivers.waveshare.firmware import UgvFirmware
 from schemas.words import Cause
 
 GENERAL: dict[str, Any] = {"T": 1001, "L": 0, "R": 0.25, "r": 1, "p": -2, "y": 90, "temp": 40.5, "v": 11.64}

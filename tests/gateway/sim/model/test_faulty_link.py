@@ -6,7 +6,7 @@ from math import inf
 
 import pytest
 
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.sim.model.faulty_link import FLOOD_INTERVAL_S, TO_HOST_LIMIT, Direction, FaultyLink, Flood
 
 FRAME = b"$1,0,0,0,0,0,0,0,0#"
@@ -180,7 +180,7 @@ def test_endless_flood_frame_is_one_frame() -> None:
     assert out.startswith(b"$4WD,CSB0000")
     assert out.count(b"$") == 1
     assert b"#" not in out
-    decoder = Decoder()
+    decoder = FrameSplitter()
     assert any("overlong" in str(event) for event in decoder.feed(out, 0.0))
 
 

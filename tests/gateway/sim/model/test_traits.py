@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from gateway.control.driver import Rejected
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 from schemas.words import Cause, Mode
@@ -229,6 +229,6 @@ async def test_constants_in_place_of_four_readings() -> None:
 async def test_report_with_foreign_field_is_damage() -> None:
     car = virtual(traits=CarTraits(more="TP31.5"))
     await report_times(car, 3.0)
-    events = Decoder().feed(bytes(car.received), car.now)
+    events = FrameSplitter().feed(bytes(car.received), car.now)
     assert len(events) >= 2
     assert {(type(each), each.raw[-8:], each.cause) for each in events} == {(Rejected, b",TP31.5#", Cause.UNKNOWN_WORD)}

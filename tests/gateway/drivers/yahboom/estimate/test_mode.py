@@ -5,7 +5,7 @@ from msgspec.structs import replace
 
 from gateway.drivers.yahboom.estimate.learned import Learned, Rhythm
 from gateway.drivers.yahboom.estimate.mode import CONTRADICTING_FRAMES, ModeEstimator
-from gateway.drivers.yahboom.protocol.decoder import MISSING_END_SILENCE_S, Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import MISSING_END_SILENCE_S, FrameSplitter
 from gateway.drivers.yahboom.protocol.modes import only_candidate
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
@@ -27,7 +27,7 @@ SETTLED_S = {mode: BLOCK_S + (0.1 if mode is Mode.MANUAL else 1.0) for mode in M
 
 
 def reading(shape: bytes, at: float) -> Sensors:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     event = (decoder.feed(shape, at) + decoder.tick(at + MISSING_END_SILENCE_S))[0]
     assert isinstance(event, Sensors)
     return event

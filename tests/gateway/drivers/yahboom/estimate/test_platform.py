@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.drivers.yahboom.estimate.platform import EVIDENCE_FRAMES, OTHER_PROGRAM_FRAMES, PlatformDetector
-from gateway.drivers.yahboom.protocol.decoder import MISSING_END_SILENCE_S, Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import MISSING_END_SILENCE_S, FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.sim.model.factory import build
@@ -23,7 +23,7 @@ ARM = "$4WD,J190,J290,J390,J490,J590,J690#"
 
 
 def event_of(text: str) -> Event:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     return (decoder.feed(wire(text), 1.0) + decoder.tick(1.0 + MISSING_END_SILENCE_S))[0]
 
 
@@ -99,7 +99,7 @@ def test_auto_adds_the_options_that_it_hears() -> None:
 
 def hear_raw(truth: PlatformDetector, *heads: str) -> list[str]:
     """Hear sensors frames with these first words, as a decoder of the profile's head reads them."""
-    decoder = Decoder(head=truth.profile.dialect.head)
+    decoder = FrameSplitter(head=truth.profile.dialect.head)
     frames = [ARDUINO.replace("4WD", head).encode() for head in heads]
     return [words for frame in frames for event in decoder.feed(frame, 1.0) for words in truth.on_event(event)]
 
@@ -124,7 +124,7 @@ def test_damaged_frames_do_not_change_head(*, auto: bool) -> None:
     for count in range(1, OTHER_PROGRAM_FRAMES):
         hear_raw(truth, "4WD", *["WD"] * count)
         assert truth.profile.dialect.head == "4WD"
-    unsettled = Decoder().feed(ARDUINO.encode(), 1.0)
+    unsettled = FrameSplitter().feed(ARDUINO.encode(), 1.0)
     for event in unsettled:
         truth.on_event(event, counts=False)
     hear_raw(truth, "WD")
@@ -164,7 +164,7 @@ def test_simulated_cars_are_detected_without_contradiction(platform: str, world:
         car = build(platform, WORLDS[world](), 0, random.Random(3), options=frozenset({"arm"}))
         told = PlatformDetector(parse_platform(f"{platform}+arm"))
         auto = PlatformDetector(parse_platform("unknown"), auto=True)
-        decoder = Decoder()
+        decoder = FrameSplitter()
         car.feed(frame_of(mode), 0.0)
         for tenth in range(300):
             for at, data in car.advance(tenth / 10):

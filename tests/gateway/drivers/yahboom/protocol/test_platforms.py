@@ -5,7 +5,7 @@ import re
 import pytest
 
 from gateway.control.driver import Rejected
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import ArmSet, Dialect, Frame, General, ModeClose, Ptz, Reset, parse_sent
 from gateway.drivers.yahboom.protocol.measurements import verdict_of
 from gateway.drivers.yahboom.protocol.modes import EVERY_MEASUREMENT, MODES, candidate_modes, only_candidate
@@ -22,7 +22,7 @@ ALL = "range battery grayscale line obstacle light"
 
 
 def sensors(raw: bytes, ended: str) -> Sensors:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     event = (decoder.feed(raw + (b"$" if ended == "$" else b""), 1.0) + decoder.tick(2.0))[0]
     assert isinstance(event, Sensors)
     assert (event.terminated, event.by_silence) == (ended == "#", ended == "silence")
@@ -255,7 +255,7 @@ def test_frame_of_other_head_is_not_parsed() -> None:
 
 def test_readings_of_another_head_are_known_in_every_mode() -> None:
     profile = parse_platform("arduino+head=BALA")
-    decoder = Decoder(head=profile.dialect.head)
+    decoder = FrameSplitter(head=profile.dialect.head)
     texts = (b"CSB57.24,PV7.91,GS214,LF1011,HW01,GM10", b"CSB0,PV8,GS0,LF0110,HW00,GM00")
     events = decoder.feed(b"".join(b"$BALA,%b#" % text for text in texts), 1.0)
     events += decoder.feed(b"$BALA,CSB120,PV8.3,GS000,LF0000,HW10,GM00", 2.0) + decoder.tick(3.0)
@@ -267,7 +267,7 @@ def test_readings_of_another_head_are_known_in_every_mode() -> None:
 
 def test_readings_of_another_head_than_the_given_one_are_rejected() -> None:
     good = b"$4WD,CSB57.24,PV7.91,GS214,LF1011,HW01,GM10#"
-    (event,) = Decoder(head="BALA").feed(good, 1.0)
+    (event,) = FrameSplitter(head="BALA").feed(good, 1.0)
     assert isinstance(event, Rejected)
     assert event.detail == "'4WD' is not BALA"
-    assert verdict_of(Decoder(head="BALA").feed(b"BALA on\r\n" + b"$", 1.0)[0]) == "no_start"
+    assert verdict_of(FrameSplitter(head="BALA").feed(b"BALA on\r\n" + b"$", 1.0)[0]) == "no_start"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gateway.control.commands import Drive, Fan, SetMode, Stop
 from gateway.control.driver import Rejected
 from gateway.drivers.yahboom.estimate.learned import AGREEING_DELAYS, UNREACTED, Learned
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.stops import cases
@@ -44,7 +44,7 @@ TOLERANCE_S = 0.05
 
 
 def event(frame: bytes, at: float) -> Sensors:
-    (found,) = Decoder().feed(frame, at)
+    (found,) = FrameSplitter().feed(frame, at)
     assert isinstance(found, Sensors)
     return found
 

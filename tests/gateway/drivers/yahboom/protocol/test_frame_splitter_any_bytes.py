@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.protocol.wire_events import Event, ImuReading
 
@@ -41,7 +41,7 @@ def timeless(events: list[Event]) -> list[Event]:
 
 def events_of(bursts: list[tuple[bytes, float]], size: int | None, *, ticks: bool) -> list[Event]:
     """Return all events of bursts in pieces of `size` bytes, with or without the requested ticks."""
-    decoder, now, events = Decoder(), 100.0, []
+    decoder, now, events = FrameSplitter(), 100.0, []
     decoder.sent(b"$4WD,MODE00#", now)
     decoder.sent(b"#", now)
     for burst, silence in bursts:
@@ -65,8 +65,8 @@ def test_same_events_however_the_bytes_are_cut(bursts: list[tuple[bytes, float]]
 
 @given(STREAM, st.lists(st.integers(0, 2000), max_size=8))
 def test_same_events_for_arbitrary_cuts(stream: bytes, cuts: list[int]) -> None:
-    whole = Decoder()
-    cut = Decoder()
+    whole = FrameSplitter()
+    cut = FrameSplitter()
     edges = sorted({0, len(stream), *(edge for edge in cuts if edge < len(stream))})
     events = [event for start, end in pairwise(edges) for event in cut.feed(stream[start:end], 1.0)]
     assert events + cut.end() == whole.feed(stream, 1.0) + whole.end()
@@ -74,7 +74,7 @@ def test_same_events_for_arbitrary_cuts(stream: bytes, cuts: list[int]) -> None:
 
 @given(st.one_of(STREAM, st.binary(max_size=2000)))
 def test_no_byte_is_lost_or_seen_twice(stream: bytes) -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     events = decoder.feed(stream, 1.0) + decoder.end()
     assert all(0 < len(event.raw) <= 256 for event in events)
     place = 0
@@ -88,7 +88,7 @@ def test_no_byte_is_lost_or_seen_twice(stream: bytes) -> None:
 @given(st.binary(max_size=3000).filter(lambda garbage: b"$" not in garbage[-300:]))
 def test_good_frame_after_any_garbage_decodes(garbage: bytes) -> None:
     good = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
-    event = Decoder().feed(garbage + good, 1.0)[-1]
+    event = FrameSplitter().feed(garbage + good, 1.0)[-1]
     assert isinstance(event, Sensors)
     assert event.raw == good
 
@@ -114,7 +114,7 @@ BITS = st.sampled_from("01")
 )
 def test_readings_of_every_spelling(csb: str, pv: str, gs: int, pad: int, bits: str, ended: bool) -> None:
     text = f"$4WD,CSB{csb},PV{pv},GS{gs:0{pad}d},LF{bits[:4]},HW{bits[4:6]},GM{bits[6:]}{'#' if ended else ''}"
-    event = Decoder().feed(text.encode() + b"$", 1.0)[0]
+    event = FrameSplitter().feed(text.encode() + b"$", 1.0)[0]
     assert isinstance(event, Sensors)
     assert (event.range_cm, event.voltage_v, event.grayscale) == (float(csb), float(pv), gs)
     seen = (*(event.line or ()), *(event.obstacle or ()), *(event.light or ()))
@@ -129,6 +129,6 @@ RAW = st.one_of(st.integers(-32768, 32767).map(str), st.decimals(-32768, 32767, 
 def test_gyro_readings(raw: list[str]) -> None:
     words = ("MPUgx", "MPUgy", "MPUgz", "MPUax", "MPUay", "MPUaz")
     frame = "$4WD," + ",".join(word + text for word, text in zip(words, raw, strict=True)) + "#"
-    (event,) = Decoder().feed(frame.encode(), 1.0)
+    (event,) = FrameSplitter().feed(frame.encode(), 1.0)
     assert isinstance(event, ImuReading)
     assert event.gyro + event.accel == tuple(map(float, raw))

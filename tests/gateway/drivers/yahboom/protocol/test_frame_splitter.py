@@ -3,7 +3,7 @@
 import pytest
 
 from gateway.control.driver import Echo, Rejected, TextLine
-from gateway.drivers.yahboom.protocol.decoder import Decoder
+from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.measurements import verdict_of
 from gateway.drivers.yahboom.protocol.sensors import Sensors, head_of
 from gateway.drivers.yahboom.protocol.wire_events import ArmReading, Event, ImuReading
@@ -16,7 +16,7 @@ FOLLOWING = b"$4WD,CSB120,PV8.3,GS000,LF0000,HW10,GM00"
 
 
 def one(data: bytes) -> Event:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     (event,) = decoder.feed(data, 1.0)
     assert decoder.deadline() is None
     return event
@@ -62,7 +62,7 @@ def test_arm_and_gyro_frames_of_the_table(row: dict[str, str]) -> None:
 @pytest.mark.parametrize("row", BAD, ids=ids(BAD))
 def test_bad_frames_are_counted_by_cause_and_next_decodes(row: dict[str, str]) -> None:
     bad = wire(row["bytes"])
-    *rejected, good = Decoder().feed(bad + GOOD, 1.0)
+    *rejected, good = FrameSplitter().feed(bad + GOOD, 1.0)
     assert [event.cause for event in rejected if isinstance(event, Rejected)] == row["causes"].split()
     assert len(rejected) == len(row["causes"].split())
     assert b"".join(event.raw for event in rejected) == (bad.strip() if row["causes"] != "truncated" else bad)
@@ -77,7 +77,7 @@ def test_causes_are_all_tested() -> None:
 
 
 def test_missing_frame_end_is_accepted_at_next_frame() -> None:
-    first, second = Decoder().feed(FOLLOWING + GOOD, 1.0)
+    first, second = FrameSplitter().feed(FOLLOWING + GOOD, 1.0)
     assert isinstance(first, Sensors)
     assert (first.raw, first.terminated, first.by_silence) == (FOLLOWING, False, False)
     assert isinstance(second, Sensors)
@@ -85,7 +85,7 @@ def test_missing_frame_end_is_accepted_at_next_frame() -> None:
 
 
 def test_missing_frame_end_is_accepted_after_50_ms_silence() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     assert decoder.feed(FOLLOWING, 1.0) == []
     assert decoder.deadline() == pytest.approx(1.05)
     assert decoder.tick(1.049) == []
@@ -97,7 +97,7 @@ def test_missing_frame_end_is_accepted_after_50_ms_silence() -> None:
 
 
 def test_feed_sees_a_silence_that_no_tick_told_it_of() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(FOLLOWING, 1.0)
     first, second = decoder.feed(GOOD, 2.0)
     assert isinstance(first, Sensors)
@@ -106,7 +106,7 @@ def test_feed_sees_a_silence_that_no_tick_told_it_of() -> None:
 
 
 def test_late_frame_end_is_no_junk() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(FOLLOWING, 1.0)
     assert len(decoder.tick(1.06)) == 1
     (event,) = decoder.feed(b"#" + GOOD, 1.07)
@@ -117,7 +117,7 @@ def test_late_frame_end_is_no_junk() -> None:
 
 @pytest.mark.parametrize("cut", range(1, len(FOLLOWING)))
 def test_rest_of_frame_may_be_late(cut: int) -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(FOLLOWING[:cut], 1.0)
     assert decoder.tick(1.49) == []
     (event,) = decoder.feed(FOLLOWING[cut:] + b"#", 1.49)
@@ -127,7 +127,7 @@ def test_rest_of_frame_may_be_late(cut: int) -> None:
 @pytest.mark.parametrize("ticks", [True, False])
 @pytest.mark.parametrize("cut", range(1, len(FOLLOWING)))
 def test_silence_ends_an_incomplete_frame(cut: int, *, ticks: bool) -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(FOLLOWING[:cut], 1.0)
     assert decoder.deadline() == pytest.approx(1.5)
     events = decoder.tick(1.5) if ticks else []
@@ -137,7 +137,7 @@ def test_silence_ends_an_incomplete_frame(cut: int, *, ticks: bool) -> None:
 
 
 def test_silence_ends_a_run_of_junk() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     assert decoder.feed(b"hel", 1.0) == []
     assert decoder.feed(b"lo\r\n", 1.02) == []
     assert decoder.deadline() == pytest.approx(1.07)
@@ -147,7 +147,7 @@ def test_silence_ends_a_run_of_junk() -> None:
 
 
 def test_separators_between_frames_make_no_event_and_want_no_tick() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     assert len(decoder.feed(GOOD + b"\r\n", 1.0)) == 1
     assert decoder.deadline() is None
     assert decoder.feed(b"\r\n \t" * 1000, 1.0) == []
@@ -155,7 +155,7 @@ def test_separators_between_frames_make_no_event_and_want_no_tick() -> None:
 
 
 def test_time_is_that_of_the_last_byte() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(GOOD[:10], 1.0)
     decoder.feed(GOOD[10:-1], 1.01)
     (event,) = decoder.feed(GOOD[-1:], 1.02)
@@ -180,7 +180,7 @@ class TestOverlong:
         assert len(longest) == 256
         assert isinstance(one(longest), Sensors)
         longer = longest.replace(b"GS1", b"GS01")
-        cut, tail, good = Decoder().feed(longer + GOOD, 1.0)
+        cut, tail, good = FrameSplitter().feed(longer + GOOD, 1.0)
         assert isinstance(cut, Rejected)
         assert (cut.cause, cut.raw) == (Cause.OVERLONG, longer[:256])
         assert isinstance(tail, Rejected)
@@ -188,13 +188,13 @@ class TestOverlong:
         assert isinstance(good, Sensors)
 
     def test_256_bytes_and_then_a_start_are_truncated(self) -> None:
-        cut, good = Decoder().feed(b"$" + b"x" * 255 + GOOD, 1.0)
+        cut, good = FrameSplitter().feed(b"$" + b"x" * 255 + GOOD, 1.0)
         assert isinstance(cut, Rejected)
         assert cut.cause is Cause.TRUNCATED
         assert isinstance(good, Sensors)
 
     def test_frame_that_never_ends_is_held_in_bounds(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         events = [event for _ in range(5000) for event in decoder.feed(b"$4WD,CSB" + b"1" * 20 + b"." * 200, 1.0)]
         assert len(decoder._buffer) <= 256
         events = decoder.feed(b"1" * 1_000_000, 1.0)
@@ -206,39 +206,39 @@ class TestOverlong:
     @pytest.mark.parametrize("most", [0, 63, 257, 10_000])
     def test_limit_is_itself_limited(self, most: int) -> None:
         with pytest.raises(ValueError, match=r"max_frame: \d+, allowed are 64\.\.256"):
-            Decoder(most)
+            FrameSplitter(most)
 
 
 class TestEcho:
     SENT = b"$4WD,ServoJ10,J230,J360,J490,J5120,J6180#"
 
     def test_our_own_frame_within_2_s_is_no_reading(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         decoder.sent(self.SENT, 1.0)
         assert decoder.feed(self.SENT, 3.0) == [Echo(self.SENT, 3.0)]
         assert isinstance(decoder.feed(self.SENT, 3.01)[0], ArmReading)
 
     def test_echo_in_pieces_and_repeated(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         decoder.sent(self.SENT, 1.0)
         events = [event for byte in self.SENT * 2 for event in decoder.feed(bytes([byte]), 1.5)]
         assert events == [Echo(self.SENT, 1.5)] * 2
 
     def test_sensors_frame_that_we_sent_is_an_echo_too(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         decoder.sent(GOOD, 1.0)
         assert decoder.feed(GOOD, 1.1) == [Echo(GOOD, 1.1)]
         assert isinstance(decoder.feed(GOOD, 3.1)[0], Sensors)
 
     def test_lone_end(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         decoder.sent(b"#", 1.0)
         decoder.sent(b"$4WD,MODE00#", 1.05)
         echoes = decoder.feed(b"#\r\n$4WD,MODE00#", 1.1)
         assert echoes == [Echo(b"#", 1.1), Echo(b"$4WD,MODE00#", 1.1)]
 
     def test_sent_frames_are_forgotten_after_a_while(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         for i in range(10_000):
             decoder.sent(b"$4WD,PTZ%d#" % i, i * 0.001)
         assert len(decoder._sent) <= 256
@@ -248,7 +248,7 @@ class TestEcho:
 
 class TestEnd:
     def test_half_a_frame(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         decoder.feed(GOOD[:-5], 1.0)
         (event,) = decoder.end()
         assert isinstance(event, Rejected)
@@ -256,7 +256,7 @@ class TestEnd:
         assert decoder.end() == []
 
     def test_whole_frame_without_end_counts_after_silence(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         decoder.feed(FOLLOWING, 1.0)
         (event,) = decoder.end()
         assert isinstance(event, Sensors)
@@ -264,7 +264,7 @@ class TestEnd:
         assert isinstance(decoder.feed(b"#$", 1.0)[0], Rejected), "a new link has no late end"
 
     def test_junk(self) -> None:
-        decoder = Decoder()
+        decoder = FrameSplitter()
         decoder.feed(b"junk", 1.0)
         (event,) = decoder.end()
         assert isinstance(event, Rejected)
@@ -278,7 +278,7 @@ def kinds(events: list[Event]) -> list[tuple[str, bytes]]:
 @pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r"])
 def test_whole_line_of_text_is_no_damage(end: bytes) -> None:
     line = b"EXEC:F" + end
-    events = Decoder().feed(GOOD + line + GOOD + b"\r\n" + line + b"Motor on, 3 A" + end + GOOD, 1.0)
+    events = FrameSplitter().feed(GOOD + line + GOOD + b"\r\n" + line + b"Motor on, 3 A" + end + GOOD, 1.0)
     expected = [GOOD, line, GOOD, line, b"Motor on, 3 A" + end, GOOD]
     assert kinds(events) == [("sensors" if raw == GOOD else "text", raw) for raw in expected]
 
@@ -298,17 +298,17 @@ NO_TEXT = [
 
 @pytest.mark.parametrize("junk", NO_TEXT)
 def test_piece_of_frame_or_line_is_no_text(junk: bytes) -> None:
-    assert kinds(Decoder().feed(junk + GOOD, 1.0)) == [("no_start", junk.rstrip()), ("sensors", GOOD)]
+    assert kinds(FrameSplitter().feed(junk + GOOD, 1.0)) == [("no_start", junk.rstrip()), ("sensors", GOOD)]
 
 
 def test_text_and_damage_runs_are_separate_events() -> None:
-    events = Decoder().feed(b"\xff\r\n\xfe\r\nEXEC:F\r\n\r\n12\r\nEX" + GOOD, 1.0)
+    events = FrameSplitter().feed(b"\xff\r\n\xfe\r\nEXEC:F\r\n\r\n12\r\nEX" + GOOD, 1.0)
     expected = [("no_start", b"\xff\r\n\xfe"), ("text", b"EXEC:F\r\n"), ("no_start", b"12\r\nEX"), ("sensors", GOOD)]
     assert kinds(events) == expected
 
 
 def test_rest_of_damaged_line_is_no_text() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(b"\xff\xfe", 1.0)
     assert kinds(decoder.feed(b"EXEC:F\r\nEXEC:F\r\n", 2.0) + decoder.end()) == [
         ("no_start", b"\xff\xfe"),
@@ -322,7 +322,7 @@ def test_rest_of_damaged_line_is_no_text() -> None:
 
 @pytest.mark.parametrize("size", [1, 7, 100])
 def test_line_after_frame_is_whole(size: int) -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(b"\xff\xfe", 1.0)
     rest, events = GOOD + b"EXEC:F\r\n", []
     for start in range(0, len(rest), size):
@@ -331,15 +331,19 @@ def test_line_after_frame_is_whole(size: int) -> None:
 
 
 def test_rest_of_damaged_frame_is_no_text() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     decoder.feed(b"$4WD,CSB1", 1.0)
     assert kinds(decoder.feed(b"hello\r\n", 2.0) + decoder.end())[-1] == ("no_start", b"hello")
     overlong = b"$" + b"x" * 300 + b"\r\n"
-    assert [kind for kind, _ in kinds(Decoder().feed(overlong + GOOD, 1.0))] == ["overlong", "no_start", "sensors"]
+    assert [kind for kind, _ in kinds(FrameSplitter().feed(overlong + GOOD, 1.0))] == [
+        "overlong",
+        "no_start",
+        "sensors",
+    ]
 
 
 def test_recorded_text_decodes_to_same_events() -> None:
-    decoder = Decoder()
+    decoder = FrameSplitter()
     for raw in (b"\xff", b"EXEC:F\r\n", b"hello", b"EXEC:F\r\n"):
         assert kinds(decoder.feed(raw, 1.0) + decoder.end()) == [("text" if b"EXEC" in raw else "no_start", raw)]
 

@@ -43,8 +43,8 @@ _TEXT = re.compile(rb"(?=.*[A-Za-z]{2})[\t\x20-\x22\x24-\x7e]+")
 _PROTOCOL_WORD = re.compile(rb"(?<![A-Za-z])(?:4WD|CSB|PV|GS|LF|HW|GM|J[1-6]|MPU|Servo|PTZ|CL[RGB]|MODE)")
 
 
-class Decoder:
-    """Decodes the bytes of one link. Make a new decoder for a new link: its bytes must not complete an old frame."""
+class FrameSplitter:
+    """Splits the bytes of one link. Make a new one for a new link, whose bytes must not complete an old frame."""
 
     def __init__(self, max_frame: int = MAX_FRAME, *, head: str = STANDARD_HEAD) -> None:
         """`head` is the first word of the frames of this car."""
