@@ -83,6 +83,8 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
             words = "; ".join(deeds)
             say(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}. No plan is running.")
         return
+    if not found and not subjects:
+        click.echo("The coordinator has not decided anything yet: repeat this in a second.", err=True)
     for subject in subjects or sorted(found):
         reading = found.get(subject) or found.get(f"role {subject}")
         if reading is None:

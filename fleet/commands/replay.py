@@ -59,7 +59,7 @@ def replay(
             out = save if save is not None else Path(scratch) / f"{found.name}.rrd"
             must_say_damage = True
             try:
-                _export(found, out, part, cars)
+                _export(found, out, part, cars, name=found.name if save is None else str(save))
             except NoSession:
                 must_say_damage = False  # this error names the damage
                 raise
@@ -103,7 +103,7 @@ def quiet_rerun() -> None:
         raise ModuleNotFoundError(name="rerun")
 
 
-def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) -> None:
+def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...], name: str) -> None:
     from fleet.replay.rerun.rrd_export import ExportFailed, export
 
     try:
@@ -123,7 +123,7 @@ def _export(session: "Session", out: Path, part: "Part", cars: tuple[str, ...]) 
             f"{out} cannot be written: {error.strerror}. The export needs twice the size of the recording; "
             "name another place (--save), or set TMPDIR to a directory with room."
         ) from None
-    click.echo(f"{out}: {replayed.shown.total()} messages on {len(replayed.shown)} keys")
+    click.echo(f"{name}: {replayed.shown.total()} messages on {len(replayed.shown)} keys")
     for line in replayed.left_out.words():
         click.echo(f"not shown: {line}", err=True)
 

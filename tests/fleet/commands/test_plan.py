@@ -61,3 +61,12 @@ def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
             assert complete_hints(held, options) in shown
         safety.CopyFrom(pb.Safety(car="red"))
         assert run("why").stderr == one
+
+
+def test_why_tells_that_a_new_coordinator_has_not_decided_yet() -> None:
+    endpoint = free_endpoint()
+    with zenoh.open(router_config(endpoint)), Fleet(endpoint, kind="person") as client:
+        token = client.bus.token(keys.car_token("fleet", keys.COORDINATOR))
+        done = CliRunner().invoke(cli, ["why", "--connect", endpoint])
+        assert (done.exit_code, done.stdout) == (0, ""), token
+        assert done.stderr
