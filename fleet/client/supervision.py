@@ -44,6 +44,11 @@ def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
     return {car: color for status in ask_cars(bus, fleet) for car, color in colors_of(status).items()}
 
 
+def cars_of(status: Any) -> set[str]:
+    """Return the cars with a gateway in a fleet.v1.Supervision."""
+    return {each.name for each in status.processes if keys.is_name(each.name)}
+
+
 def colors_of(status: Any) -> dict[str, Rgb]:
     """Return the colors of the cars in a fleet.v1.Supervision. Skip values that are not colors."""
     colors: dict[str, Rgb] = {}

@@ -190,7 +190,7 @@ def _stop(
     client, hung = _client_that_stops(connect, fleet)
     with client:
         try:
-            outcomes = stop_in_all_fleets(client, connect, words, act)
+            outcomes = stop_in_all_fleets(client, connect, act)
         except KeyboardInterrupt:
             click.echo(f"fleet: the stop was sent. Nothing shows yet that a car stands: look at it.{lasts}", err=True)
             raise

@@ -4,7 +4,7 @@ A stop asks nobody: it stops the cars in all fleets that it could mean.
 """
 
 import sys
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
-from fleet.client.supervision import fleets_on
+from fleet.client.supervision import ask_cars, cars_of, fleets_on
 from fleet.commands.group import choose_fleet, chosen_person, is_named, name_fleet_in_hints
 from fleet.commands.params import ALL_CARS
 from schemas.bus import Bus
@@ -25,16 +25,11 @@ def candidates(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> list[str]:
     If at most one fleet runs on the bus, return `fleet`. If there are several, hints name a fleet from now on.
     """
     found = fleets_on(bus)
-    if len(found) > 1:
-        name_fleet_in_hints()
-    return _meant(found, fleet, cars)
-
-
-def _meant(found: Mapping[str, Container[str]], fleet: str, cars: Iterable[str]) -> list[str]:
     if len(found) < 2:
         return [fleet]
-    wanted = [each for each in cars if each != ALL_CARS and not each.startswith("@")]
-    return sorted(name for name in found if all(each in found[name] for each in wanted)) or sorted(found)
+    name_fleet_in_hints()
+    wanted = {each for each in cars if each != ALL_CARS and not each.startswith("@")}
+    return sorted(name for name, members in found.items() if wanted <= members) or sorted(found)
 
 
 def the_fleet(bus: Bus, fleet: str, cars: Iterable[str] = ()) -> str:
@@ -103,12 +98,11 @@ def _ambiguous(possible: Sequence[str]) -> click.UsageError:
     return click.UsageError(f"Several fleets could be meant: {', '.join(possible)}. Say which one with --fleet NAME.")
 
 
-def stop_in_all_fleets(
-    client: Fleet, connect: str | None, cars: Sequence[str], act: Callable[[Fleet], Sequence[Outcome]]
-) -> list[Outcome]:
-    """Stop the cars in this client's fleet, and meanwhile those in every other fleet that the command could mean.
+def stop_in_all_fleets(client: Fleet, connect: str | None, act: Callable[[Fleet], Sequence[Outcome]]) -> list[Outcome]:
+    """Stop the cars in this client's fleet, and meanwhile in every other fleet on the bus, unless the user named one.
 
-    `act` stops the cars in the fleet of a client, and returns their outcomes.
+    `act` stops the cars in the fleet of a client, and returns their outcomes. A car whose gateway hangs has no token.
+    So nobody can tell before the stop which fleets have the cars.
     """
     if is_named():
         return list(act(client))
@@ -116,7 +110,7 @@ def stop_in_all_fleets(
 
     def elsewhere() -> list[tuple[str, Outcome]]:
         members.update(fleets_on(client.bus))
-        others = [name for name in _meant(members, client.name, cars) if name != client.name]
+        others = sorted(members.keys() - {client.name})
         if not others:
             return []
         with ThreadPoolExecutor(len(others)) as pool:
@@ -136,6 +130,9 @@ def stop_in_all_fleets(
     # fleet that does not answer.
     both = [*((client.name, each) for each in own), *found]
     answered = {each.car for _, each in both if each.phase != NO_ANSWER}
+    silent = {fleet for fleet, each in both if each.phase == NO_ANSWER and each.car in answered}
+    for fleet in silent:  # the supervisor knows the cars whose gateways hang or have ended
+        members.setdefault(fleet, set()).update(car for each in ask_cars(client.bus, fleet) for car in cars_of(each))
     return [
         each if fleet == client.name else replace(each, car=f"{fleet}/{each.car}")
         for fleet, each in both

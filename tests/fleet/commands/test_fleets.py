@@ -11,18 +11,29 @@ from fleet.client.client import Fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.commands.fleets import stop_in_all_fleets
 from schemas import keys
-from schemas.bus import router_config
+from schemas.bus import reply_message, router_config
+from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Phase
 from tests.support.ports import free_endpoint
 
 
 @pytest.fixture
 def client() -> Iterator[Fleet]:
-    """Return a client of the fleet `one`, which has red and blue. `two` has red and green."""
+    """Return a client of the fleet `one`, which has red and blue, and white, whose gateway hangs.
+
+    `two` has red and green.
+    """
     endpoint = free_endpoint()
     with zenoh.open(router_config(endpoint)), Fleet(endpoint, "one", kind="person") as fleet:
         cars = (("one", "red"), ("one", "blue"), ("two", "red"), ("two", "green"))
         tokens = [fleet.bus.token(keys.car_token(name, car)) for name, car in cars]
+        status = pb.Supervision(processes=[pb.Supervised(name=name) for name in ("@hub", "red", "blue", "white")])
+
+        def answer(query: zenoh.Query) -> bool:
+            reply_message(query, "one/@supervisor/status", status, as_json=False)
+            return True
+
+        fleet.bus.queryable("one/@supervisor/status", answer)
         yield fleet
         assert tokens
 
@@ -35,6 +46,7 @@ def client() -> Iterator[Fleet]:
         (["red"], ["one/red"], {"red": NO_ANSWER, "two/red": Phase.COMPLETE}),
         (["red"], ["one/red", "two/red"], {"red": NO_ANSWER, "two/red": NO_ANSWER}),
         (["green"], ["one/green"], {"two/green": Phase.COMPLETE}),
+        (["white"], ["one/white"], {"white": NO_ANSWER, "two/white": Phase.COMPLETE}),
         (["blue", "green"], ["one/green", "two/blue"], {"blue": Phase.COMPLETE, "two/green": Phase.COMPLETE}),
         (["white"], ["one/white", "two/white"], {"white": NO_ANSWER, "two/white": NO_ANSWER}),
     ],
@@ -47,5 +59,5 @@ def test_silent_car_is_told_unless_only_another_fleet_has_it(
         return [Outcome(car, ok=phase == Phase.COMPLETE, phase=phase) for car, phase in phases.items()]
 
     with click.Context(cli):
-        outcomes = stop_in_all_fleets(client, client.bus.endpoint, wanted, act)
+        outcomes = stop_in_all_fleets(client, client.bus.endpoint, act)
     assert {each.car: each.phase for each in outcomes} == told
