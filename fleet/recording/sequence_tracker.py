@@ -110,6 +110,11 @@ class SequenceTracker:
             self._skip(known, known.last, ahead + 1)
             known.last = number
 
+    def is_missing(self, sender: Hashable, number: int) -> bool:
+        """Return True if this number of a sender is in a gap that a backfill may close."""
+        known = self.senders.get(sender)
+        return known is not None and any(gap.first <= number <= gap.last for gap in known.gaps)
+
     def add_backfilled(self, sender: Hashable, number: int, published_ns: int) -> bool:
         """Add a backfilled message. Return False if it is a duplicate."""
         known = self.senders.get(sender)

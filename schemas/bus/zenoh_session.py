@@ -493,6 +493,11 @@ class Bus:
         return (reply.ok for reply in replies if reply.ok is not None)
 
     @property
+    def link(self) -> str:
+        """The link to the hub: a text that no two links share. Empty while messages reach no hub."""
+        return self._link.address
+
+    @property
     def hubs(self) -> tuple[str, ...]:
         """The ids of the linked routers. A restarted hub has another id."""
         return tuple(sorted(str(hub) for hub in self._session.info.routers_zid()))

@@ -13,6 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from math import inf
 from typing import Final
 
 import zenoh
@@ -20,11 +21,14 @@ import zenoh
 from fleet.recording.writing.backfill_plan import EVERYTHING, BackfillPlan, PlannedQuery
 from fleet.recording.writing.resume import RESUME_WINDOW_S
 from schemas.bus import Bus
+from schemas.bus.sample import session_of
 
 BACKFILL_POLL_INTERVAL_S: Final = 0.2
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
 """Number of polls in 2 s. This is Zenoh's lease: only a silence of this time shows that a link is lost, so messages may
 be missing since its beginning. Counted in polls, so that a stall of this process makes the window longer."""
+MAX_CLOSE_S: Final = 15.0
+"""Maximum time for the last queries. `fleet up` waits 30 s for a recorder that ends."""
 MAX_ANSWERS: Final = 200_000
 """Maximum number of answers in the queue to the writer. The rest stays a gap, and is requested again."""
 
@@ -72,42 +76,56 @@ class Backfill:
         return found
 
     def _run(self) -> None:
-        hubs = self._bus.hubs
+        link = self._bus.link
         polls = deque([time.monotonic()], LEASE_POLLS)
-        connected_since = polls[0]
+        connected_since = waiting_since = polls[0]
         while not self._closing.wait(BACKFILL_POLL_INTERVAL_S):
-            now, connected = time.monotonic(), self._bus.hubs
+            now, connected = time.monotonic(), self._bus.link
             self._plan.add_gaps(self._take_gaps(), polls[0], now)
-            if connected and connected != hubs:
+            # A process that was stopped for longer than a lease has lost its link, even if it has the same one again.
+            was_stopped = now - waiting_since > LEASE_POLLS * BACKFILL_POLL_INTERVAL_S
+            if connected and (connected != link or was_stopped):
                 self._plan.add_reconnect(connected_since, now)
-            hubs = connected
+            link = connected
             if connected:
                 connected_since = polls[0]
                 self._ask(self._plan.due_queries(now))
             polls.append(now)
-        self._plan.add_gaps(self._take_gaps(), polls[0], time.monotonic())
-        self._ask(self._plan.last_queries())
+            waiting_since = time.monotonic()
+        now = time.monotonic()
+        self._plan.add_gaps(self._take_gaps(), polls[0], now)
+        self._ask(self._plan.last_queries(now), until=now + MAX_CLOSE_S)
 
     def _take_gaps(self) -> dict[str, float]:
         with self._lock:
             gaps, self._gaps = self._gaps, {}
         return gaps
 
-    def _ask(self, queries: Iterable[PlannedQuery]) -> None:
+    def _ask(self, queries: Iterable[PlannedQuery], until: float = inf) -> None:
+        """Send these queries. Leave the rest to the last ones if the recording ends, and stop at `until`."""
         for query in queries:
             answered: set[str] = set()
+            is_whole = True
             for expression in self._all if query.source == EVERYTHING else (f"{query.source}/**",):
-                answered.update(str(sample.key_expr) for sample in self._recall(expression, query.since))
-            self._plan.add_answers(query, answered)
+                if time.monotonic() > until or (until == inf and self._closing.is_set()):
+                    return
+                is_whole &= self._recall(expression, query.since, answered)
+            if is_whole:
+                self._plan.add_answers(query, answered)
 
-    def _recall(self, expression: str, since: float) -> list[zenoh.Sample]:
+    def _recall(self, expression: str, since: float, answered: set[str]) -> bool:
+        """Fetch the messages, and add their keys to `answered`. Return False if there was no room for all of them."""
         found: list[zenoh.Sample] = []
+        is_whole = True
         # Compute the window anew for each expression: on a bad network, the answers for one take seconds, and the
         # window of the next one would be too short.
         for sample in self._bus.recall(expression, time.monotonic() - since):
             found.append(sample)
             if len(found) + len(self._answers) > MAX_ANSWERS:
+                is_whole = False
                 break
         with self._lock:
             self._answers += found
-        return found
+        # A recorder publishes, too. Its own answer says nothing about the recorder of another site.
+        answered.update(str(each.key_expr) for each in found if session_of(each) != self._bus.id)
+        return is_whole

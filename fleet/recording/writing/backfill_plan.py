@@ -8,8 +8,8 @@ after the last command none comes. And the recorder asks at the start, if it con
 One query is not enough, because others may reconnect half a second later than we do, and on a loaded machine even
 later. So each cause plans several (`QUERY_AFTER_...`). Their answers overlap, but that does no harm: every message has
 a number, and the writer knows which ones it has. And a link that is back may be lost again before anybody was asked. So
-a source that did not answer its last query stays on the list: it is asked again with its next cause, from the time at
-which its first gap began, and once more at the end of the recording.
+a source stays on the list until all keys with gaps were in an answer: it is asked again with its next cause, from the
+time at which its first gap began, and once more at the end of the recording.
 
 How far back should it ask? The window of a query is relative ("the last 13 s"), and the publisher counts it back from
 the arrival of the query, with its own clock. So it works even if that clock is wrong by an hour, unlike an absolute
@@ -17,10 +17,11 @@ time. But every delay of the query moves the window forward, and the oldest miss
 says since when, and the length is computed just before each query. Gaps have a margin for the delay.
 """
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from math import inf
 from typing import Final
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 QUERY_AFTER_START_S: Final = (1.0,)
 """Delay of the query after the start. It is for publishers that started with us and may have missed our
@@ -29,9 +30,14 @@ QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
 """Delays of the queries after a reconnect. Other clients reconnect within half a second, or later on a loaded
 machine."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
+QUERY_INTERVAL_S: Final = 1.0
+"""Minimum interval of the first queries of two gaps of one source. A network that loses messages all the time would
+otherwise be asked for a whole car five times a second."""
 GAP_MARGIN_S: Final = 2.0
 """Margin of a window for two delays of the network. The last message before the gap was published before it arrived, so
 the gap may begin earlier than that. And the publisher counts the window back from the late arrival of the query."""
+MAX_ANSWERS_OF_OTHERS: Final = 10
+"""Number of answers of others of its source after which a key is given up: its publisher has no cache."""
 MAX_SINGLE_SOURCES: Final = 16
 """Maximum number of sources to ask one by one. If there are more, ask everything."""
 EVERYTHING: Final = ""
@@ -46,10 +52,16 @@ class PlannedQuery(Struct, frozen=True):
 
 
 class _Asked(Struct):
-    """A source that has to be asked. `due` is empty if it waits for its next cause."""
+    """A source that has to be asked. Without `due`, it waits for its next cause."""
 
-    since: float
-    due: list[float]
+    due: list[tuple[float, float]] = field(default_factory=list)
+    """When to ask, and since when messages may be missing."""
+    unanswered_since: float = inf
+    """The earliest time for which no query was answered."""
+    keys: dict[str, int] = field(default_factory=dict)
+    """Keys with gaps, and how often others of this source have answered meanwhile. The publishers of these keys have to
+    answer, because a car may have others."""
+    asked_at: float = -inf
 
 
 class BackfillPlan:
@@ -68,48 +80,69 @@ class BackfillPlan:
 
         `silent_since`: the earliest time since which a link may have been lost without our notice.
         """
-        for key, since in gaps.items():
-            self._plan(source_of(key), min(silent_since, since - GAP_MARGIN_S), QUERY_AFTER_GAP_S, now)
+        since: dict[str, float] = {}
+        for key, at in gaps.items():
+            source = source_of(key)
+            since[source] = min(since.get(source, silent_since), at - GAP_MARGIN_S)
+        for source, at in since.items():
+            self._plan(source, at, QUERY_AFTER_GAP_S, now)
+        for key in gaps:
+            self._asked[source_of(key)].keys.setdefault(key, 0)
 
     def add_reconnect(self, since: float, now: float) -> None:
         """Plan queries after our own link was lost, which was whole until `since`."""
-        for source in (EVERYTHING, *(each for each, asked in self._asked.items() if not asked.due)):
-            self._plan(source, since, QUERY_AFTER_RECONNECT_S, now)
+        self._plan(EVERYTHING, since, QUERY_AFTER_RECONNECT_S, now)
+        for source, asked in self._asked.items():
+            if not asked.due:
+                self._plan(source, since, QUERY_AFTER_RECONNECT_S, now)
 
     def due_queries(self, now: float) -> list[PlannedQuery]:
         """Return the queries that are due."""
-        due = [source for source, asked in self._asked.items() if asked.due and asked.due[0] <= now]
-        for source in due:
-            asked = self._asked[source]
-            asked.due = [each for each in asked.due if each > now]
-        return self._queries(due)
+        return self._queries(
+            [source for source, asked in self._asked.items() if asked.due and asked.due[0][0] <= now], now
+        )
 
-    def last_queries(self) -> list[PlannedQuery]:
+    def last_queries(self, now: float) -> list[PlannedQuery]:
         """Return the queries at the end of the recording: of all that may still be missing."""
-        for asked in self._asked.values():
-            asked.due = []
-        return self._queries(self._asked)
+        return self._queries(list(self._asked), now, is_last=True)
 
-    def add_answers(self, query: PlannedQuery, keys_answered: Iterable[str]) -> None:
-        """Forget the sources of this query that have answered their last one."""
-        answered: set[str] = {EVERYTHING} if query.source == EVERYTHING else set()
-        answered.update(source_of(key) for key in keys_answered)
-        for source in answered:
-            if source in self._asked and not self._asked[source].due:
+    def add_answers(self, query: PlannedQuery, answered: Collection[str]) -> None:
+        """Take the keys that a whole answer has. Forget the sources that have answered their last query."""
+        for source in {EVERYTHING, *map(source_of, answered)} if query.source == EVERYTHING else {query.source}:
+            asked = self._asked.get(source)
+            if asked is None or not (answered or source == EVERYTHING):
+                continue
+            asked.keys = {key: count + 1 for key, count in asked.keys.items() if key not in answered}
+            if any(count < MAX_ANSWERS_OF_OTHERS for count in asked.keys.values()):
+                continue
+            asked.unanswered_since, asked.keys = inf, {}
+            if not asked.due:
                 del self._asked[source]
 
     def _plan(self, source: str, since: float, after: Sequence[float], now: float) -> None:
-        asked = self._asked.setdefault(source, _Asked(since, []))
-        asked.since = min(asked.since, since)
-        planned = [now + each for each in after]
-        asked.due = [*planned, *(each for each in asked.due if each > planned[-1])]
+        if not after:
+            return
+        asked = self._asked.setdefault(source, _Asked())
+        begin = max(now, asked.asked_at + QUERY_INTERVAL_S)
+        planned = [(begin + each, since) for each in after]
+        # A query that was planned before and is due within this schedule is not needed, but the time since which it
+        # wanted to ask is.
+        earliest = min([since, *(each for at, each in asked.due if at <= planned[-1][0])])
+        asked.due = [(planned[0][0], earliest), *planned[1:], *(each for each in asked.due if each[0] > planned[-1][0])]
 
-    def _queries(self, sources: Collection[str]) -> list[PlannedQuery]:
-        if not sources:
+    def _queries(self, sources: Collection[str], now: float, *, is_last: bool = False) -> list[PlannedQuery]:
+        since: dict[str, float] = {}
+        for source in sources:
+            asked = self._asked[source]
+            served = [each for at, each in asked.due if is_last or at <= now]
+            asked.due = [each for each in asked.due if not (is_last or each[0] <= now)]
+            asked.asked_at = now
+            since[source] = asked.unanswered_since = min([asked.unanswered_since, *served])
+        if not since:
             return []
-        if EVERYTHING in sources or len(sources) > MAX_SINGLE_SOURCES:
-            return [PlannedQuery(EVERYTHING, min(self._asked[each].since for each in sources))]
-        return [PlannedQuery(each, self._asked[each].since) for each in sorted(sources)]
+        if EVERYTHING in since or len(since) > MAX_SINGLE_SOURCES:
+            return [PlannedQuery(EVERYTHING, min(since.values()))]
+        return [PlannedQuery(each, since[each]) for each in sorted(since)]
 
 
 def source_of(key: str) -> str:

@@ -158,12 +158,15 @@ class SessionWriter:
             return False
         published_ns = stamp.get_time_as_ntp64().as_nanos()
         key, sequence = str(sample.key_expr), sequence_of(source)
+        sender = (source.source_id.zid, source.source_id.eid)
         if published_ns < self._resume_since_ns:
-            return False
+            # A message in a gap belongs to this session, even if the publisher's clock is slow.
+            tracker = self._trackers.get(key)
+            if tracker is None or not tracker.is_missing(sender, sequence):
+                return False
         state = self._states.get(key)
         if state is None or state.encoding != sample.encoding:
             state = self._key_state(key, sample.encoding)
-        sender = (source.source_id.zid, source.source_id.eid)
         missing = state.tracker.missing
         if (
             not state.tracker.add_backfilled(sender, sequence, published_ns)

@@ -8,10 +8,12 @@ import pytest
 from fleet.recording.writing.backfill_plan import (
     EVERYTHING,
     GAP_MARGIN_S,
+    MAX_ANSWERS_OF_OTHERS,
     MAX_SINGLE_SOURCES,
     QUERY_AFTER_GAP_S,
     QUERY_AFTER_RECONNECT_S,
     QUERY_AFTER_START_S,
+    QUERY_INTERVAL_S,
     BackfillPlan,
     PlannedQuery,
     source_of,
@@ -28,7 +30,7 @@ def started() -> BackfillPlan:
     """Return a plan that has asked what it asks at the start."""
     plan = BackfillPlan(NOW - 10.0)
     answer(plan, plan.due_queries(NOW))
-    assert not plan.last_queries()
+    assert not plan.last_queries(NOW + 10_000.0)
     return plan
 
 
@@ -53,7 +55,7 @@ def test_gap_asks_all_publishers_of_its_car_since_the_gap() -> None:
     plan.add_gaps({STATE: NOW - 30.0}, NOW - 2.0, NOW)
     query = PlannedQuery("fleet/blue", NOW - 30.0 - GAP_MARGIN_S)
     assert asked_at(plan, NOW + 10.0, STATE) == [(after, query) for after in QUERY_AFTER_GAP_S]
-    assert not plan.last_queries()
+    assert not plan.last_queries(NOW + 10_000.0)
 
 
 def test_young_gap_asks_for_the_whole_lease() -> None:
@@ -90,7 +92,7 @@ def test_car_that_did_not_answer_is_asked_again_since_its_first_gap(cause: str) 
         plan.add_reconnect(NOW + 8.0, NOW + 10.0)
         queries = plan.due_queries(NOW + 11.0)
     else:
-        queries = plan.last_queries()
+        queries = plan.last_queries(NOW + 10_000.0)
     (query,) = queries
     assert query.source == (EVERYTHING if cause == "reconnect" else "fleet/blue")
     assert query.since == NOW - 30.0 - GAP_MARGIN_S
@@ -102,7 +104,31 @@ def test_many_sources_are_asked_at_once() -> None:
     assert len(plan.due_queries(NOW)) == MAX_SINGLE_SOURCES
     plan.add_gaps({STATE: NOW - 99.0}, NOW, NOW)
     plan.add_gaps({f"fleet/car{number}/state/link": NOW - number for number in range(MAX_SINGLE_SOURCES)}, NOW, NOW)
-    assert plan.due_queries(NOW) == [PlannedQuery(EVERYTHING, NOW - 99.0 - GAP_MARGIN_S)]
+    assert plan.due_queries(NOW + QUERY_INTERVAL_S) == [PlannedQuery(EVERYTHING, NOW - 99.0 - GAP_MARGIN_S)]
+
+
+def test_answers_of_another_publisher_of_the_car_do_not_count() -> None:
+    plan = started()
+    plan.add_gaps({EVENT: NOW - 30.0}, NOW - 2.0, NOW)
+    assert asked_at(plan, NOW + 10.0, "fleet/blue/sensor/pose")
+    (query,) = plan.last_queries(NOW + 10.0)
+    assert query == PlannedQuery("fleet/blue", NOW - 30.0 - GAP_MARGIN_S)
+    plan.add_answers(query, [EVENT])
+    assert not plan.last_queries(NOW + 11.0)
+
+
+@pytest.mark.parametrize("answered", [[STATE], [EVENT]])
+def test_car_that_loses_messages_all_the_time_is_asked_once_a_second(answered: list[str]) -> None:
+    """The publisher of a key without an answer has no cache."""
+    plan, asked, longest_s = started(), 0, 0.0
+    for step in range(300):
+        now = NOW + step / 5
+        plan.add_gaps({STATE: now - 0.2}, now - 2.0, now)
+        for query in plan.due_queries(now):
+            asked, longest_s = asked + 1, max(longest_s, now - query.since)
+            plan.add_answers(query, answered)
+    assert 55 <= asked <= 62
+    assert longest_s < (5.0 if answered == [STATE] else 5.0 + MAX_ANSWERS_OF_OTHERS)
 
 
 @pytest.mark.parametrize(
@@ -188,11 +214,11 @@ def test_nothing_is_missing_at_the_end_if_each_car_is_back(seed: int) -> None:
         for query in plan.due_queries(now):
             asked += 1
             plan.add_answers(query, answers(cars, query, now))
-    for query in plan.last_queries():
+    for query in plan.last_queries(NOW + 10_000.0):
         plan.add_answers(query, answers(cars, query, now))
     assert {key: numbers for car in cars for key, numbers in car.missing.items()} == {}
     assert asked <= 1 + len(QUERY_AFTER_GAP_S) * gaps
-    assert plan.last_queries() == []
+    assert plan.last_queries(NOW + 10_000.0) == []
 
 
 def answers(cars: Sequence[LossyCar], query: PlannedQuery, now: float) -> list[str]:

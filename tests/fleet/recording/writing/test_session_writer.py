@@ -182,3 +182,26 @@ def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
     assert gaps == {"fleet/@recorder/status": BEGUN_NS + 3 * SECOND_NS}
     assert tape.missed == {"fleet/@recorder/status": 3}
     tape.close(BEGUN_NS + 9 * SECOND_NS)
+
+
+def test_message_of_a_slow_clock_closes_its_gap(tmp_path: Path) -> None:
+    settings = {"scouting": {"multicast": {"enabled": False}}, "timestamping": {"enabled": True}}
+    samples: list[zenoh.Sample] = []
+    config = zenoh.Config.from_json5(json.dumps(settings))
+    with zenoh.open(config) as one, one.declare_subscriber("fleet/red/note") as subscriber:
+        out = one.declare_publisher("fleet/red/note", encoding=JSON)
+        for number in range(3):
+            out.put(b"{}", source_info=zenoh.SourceInfo(out.id, number))
+            samples.append(subscriber.recv())
+    first, second, third = samples
+    assert first.timestamp is not None
+    late_ns = first.timestamp.get_time_as_ntp64().as_nanos() + 3600 * SECOND_NS
+    tape = SessionWriter(tmp_path / "late", "fleet", Options(), late_ns)
+    for each in (first, third):
+        tape.add("fleet/red/note", b"{}", JSON, each.timestamp, each.source_info, late_ns)
+    assert tape.missed == {"fleet/red/note": 1}
+    assert tape.add_backfilled(second, late_ns)
+    assert not tape.add_backfilled(second, late_ns)
+    assert not tape.add_backfilled(first, late_ns)
+    assert tape.missed == {}
+    tape.close(late_ns)
