@@ -113,7 +113,7 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Stop these cars now, or all cars if you name none. A running plan leaves them alone until you drive or resume.
 
-    If several fleets on the bus could be meant, all of them stop. `fleet estop` also makes cars refuse every command.
+    Without --fleet, this reaches all fleets on the bus. `fleet estop` also makes cars refuse every command.
     `fleet mode CAR manual` stops a car without a hold, so a plan may use it at once.
     """
     _stop(connect, fleet, cars, lambda _: stop_request(), as_json=as_json)
@@ -127,7 +127,7 @@ def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: boo
 def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Emergency stop: these cars, or the whole fleet, stop and refuse every command.
 
-    If several fleets on the bus could be meant, all of them stop. `fleet resume --estops` releases the cars. For
+    Without --fleet, this reaches all fleets on the bus. `fleet resume --estops` releases the cars. For
     everyday use there is `fleet stop`: after it, cars obey again at once.
     """
     _stop(
@@ -169,7 +169,7 @@ def _stop(
     as_json: bool,
     lasts: str = "",
 ) -> Never:
-    """Stop the cars in every fleet that the command could mean. `request_for` makes the request for the named cars.
+    """Stop the cars in all fleets, unless the user named one. `request_for` makes the request for the named cars.
 
     After Ctrl-C, `lasts` says what stays in force.
     A word that names no car fails, and the other cars are stopped all the same.

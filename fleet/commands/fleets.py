@@ -1,6 +1,6 @@
 """Finds the fleet that a command means, if several are on one bus and the user has not named one.
 
-A stop asks nobody: it stops the cars in all fleets that it could mean.
+A stop asks nobody: it stops the cars in all fleets on the bus.
 """
 
 import sys
