@@ -67,4 +67,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_runtest_teardown() -> None:
     """Enable logging again, which the completion of a shell disables for the rest of its process."""
-    logging.disable(logging.NOTSET)
+    if logging.root.manager.disable:  # to set it costs each test a look at each logger
+        logging.disable(logging.NOTSET)

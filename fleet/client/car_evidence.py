@@ -12,12 +12,12 @@ from fleet.client.client import Fleet
 from fleet.client.diagnosis import RECENT_COMMAND_S, CarEvidence
 from fleet.client.gateway_clock import MAX_CLOCK_OFF_S, GatewayClock
 from fleet.client.reading import Reading, age_of_answer_s
-from fleet.client.supervision import ask_status
+from fleet.client.supervision import ask_status, gateways_of
 from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.running_cars import running_cars_of
-from schemas.words import ProcessKind, RecorderState, RunState
+from schemas.words import RecorderState, RunState
 
 _CLOCK_LISTEN_S: Final = 3.0
 """Maximum time to listen for the clocks of gateways: states come once a second."""
@@ -30,10 +30,10 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     here = running_cars_of(client.bus.endpoint, client.name)
     supervisions = ask_status(client.bus, client.name)
     processes = {
-        each.name: each
+        car: each
         for status in supervisions
-        for each in status.processes
-        if each.kind == ProcessKind.GATEWAY and each.state != RunState.ENDED
+        for car, each in gateways_of(status).items()
+        if each.state != RunState.ENDED
     }
     answers: dict[str, list[tuple[str, Reading]]] = {}
     for expression in ("*/state/*", "*/sensor/battery"):

@@ -47,7 +47,7 @@ from fleet.client.lost_hub import explain_no_fleet
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
 from fleet.client.pose import pose_message
 from fleet.client.reading import Reading, Watch, reading_of
-from fleet.client.supervision import ask_status
+from fleet.client.supervision import ask_status, gateways_of
 from fleet.client.wait import ConditionWait
 from schemas import keys, messages, topics
 from schemas.bus import Bus, BusError, Failure, NoFleet, Publisher, Sample, canon
@@ -56,7 +56,7 @@ from schemas.identity import IdentityRole, may_locate
 from schemas.identity import parse as parse_identity
 from schemas.process import json_log
 from schemas.topics import Qos
-from schemas.words import Phase, ProcessKind, Rank, RunState, Scope
+from schemas.words import Phase, Rank, RunState, Scope
 
 _EVENT: Final = topics.TOPICS["event/command"].message
 _NO_TIMEOUT_POLL_S: Final = 3600.0
@@ -449,11 +449,7 @@ class Fleet:
         names: set[str] = set()
         try:
             for status in ask_status(self.bus, self.name, ANSWER_TIMEOUT_S):
-                names |= {
-                    each.name
-                    for each in status.processes
-                    if each.kind == ProcessKind.GATEWAY and each.state != RunState.ENDED
-                }
+                names |= {car for car, each in gateways_of(status).items() if each.state != RunState.ENDED}
         except messages.BadPayload as error:
             log.warning("a supervisor's status is unreadable: %s", error)
         finally:

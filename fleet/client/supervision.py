@@ -9,6 +9,7 @@ from schemas import keys, topics
 from schemas.bus import Bus, messages_of
 from schemas.colors import Rgb, parse_color
 from schemas.topics import Qos
+from schemas.words import ProcessKind
 
 SUPERVISOR_STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
 MAX_GROUPS: Final = 64
@@ -44,9 +45,9 @@ def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
     return {car: color for status in ask_cars(bus, fleet) for car, color in colors_of(status).items()}
 
 
-def cars_of(status: Any) -> set[str]:
-    """Return the cars with a gateway in a fleet.v1.Supervision."""
-    return {each.name for each in status.processes if keys.is_name(each.name)}
+def gateways_of(status: Any) -> dict[str, Any]:
+    """Return the fleet.v1.Supervised of each gateway in a fleet.v1.Supervision, by car. Some may have ended."""
+    return {each.name: each for each in status.processes if each.kind == ProcessKind.GATEWAY}
 
 
 def colors_of(status: Any) -> dict[str, Rgb]:

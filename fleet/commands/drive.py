@@ -201,10 +201,12 @@ def _ask_returning(client: Fleet, request: CommandRequest, named: Sequence[str] 
     """Ask each of these cars, or all, when its gateway is on the bus again, which has just come back."""
     pending, asked = [], set[str]()
     until = time.monotonic() + REJOIN_S
-    while time.monotonic() < until and (named is None or not asked >= {*named}):
+    while time.monotonic() < until:
         if cars := [each for each in client.cars() if each not in asked and (named is None or each in named)]:
             pending.append(client.send(request, cars))
             asked.update(cars)
+        if named is not None and asked >= {*named}:
+            break
         time.sleep(REJOIN_POLL_S)
     if missing := [each for each in named or () if each not in asked]:  # their outcomes say that they are not there
         pending.append(client.send(request, missing))

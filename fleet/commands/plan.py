@@ -143,13 +143,7 @@ class _PlanGroup(CommandGroup):
     """A group that imports some of its commands when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return [
-            "run",
-            "set",
-            "show",
-            "try",
-            *(each for each in super().list_commands(ctx) if each not in _LISTED_FIRST),
-        ]
+        return [*_LISTED_FIRST, *(each for each in super().list_commands(ctx) if each not in _LISTED_FIRST)]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in _OWN_MODULES:
@@ -159,7 +153,7 @@ class _PlanGroup(CommandGroup):
         return command
 
 
-_LISTED_FIRST: Final = ("set", "show")
+_LISTED_FIRST: Final = ("run", "set", "show", "try")
 
 
 @click.group(

@@ -43,7 +43,7 @@ def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool
     from fleet.recording.tools.table_formats import FormatMissing
 
     # With --tables there is no question, so a single argument is DIR.
-    if tables and directory is None and sql is not None and not any(map(str.isspace, sql)):
+    if tables and directory is None and sql is not None and (Path(sql).is_dir() or len(sql.split()) == 1):
         directory, sql = Path(sql), None
     has_both_or_neither = (sql is not None) == tables
     if has_both_or_neither or (as_csv and as_json):

@@ -34,12 +34,15 @@ class Gap(Struct):
         """Return the number of missing messages."""
         return self.last - self.first + 1
 
+    def __contains__(self, number: int) -> bool:
+        return self.first <= number <= self.last
+
 
 def _fill(gaps: list[Gap], number: int) -> bool:
     """Remove a number from the gap that contains it. Return False if no gap does."""
     for place in range(len(gaps) - 1, -1, -1):
         gap = gaps[place]
-        if gap.first <= number <= gap.last:
+        if number in gap:
             parts = (
                 Gap(gap.first, number - 1, gap.after_ns, gap.before_ns),
                 Gap(number + 1, gap.last, gap.after_ns, gap.before_ns),
@@ -113,7 +116,7 @@ class SequenceTracker:
     def is_missing(self, sender: Hashable, number: int) -> bool:
         """Return True if this number of a sender is in a gap that a backfill may close."""
         known = self.senders.get(sender)
-        return known is not None and any(gap.first <= number <= gap.last for gap in known.gaps)
+        return known is not None and any(number in gap for gap in known.gaps)
 
     def add_backfilled(self, sender: Hashable, number: int, published_ns: int) -> bool:
         """Add a backfilled message. Return False if it is a duplicate."""

@@ -38,8 +38,7 @@ class Backfill:
 
     def __init__(self, bus: Bus, expressions: Sequence[str], *, resumes: bool) -> None:
         self._bus = bus
-        # Do not ask for command streams: the clients that send them have no cache.
-        self._all = tuple(expression for expression in expressions if "@cmd" not in expression)
+        self._all = tuple(filter(_has_cache, expressions))
         self._lock = threading.Lock()
         self._gaps: dict[str, float] = {}
         """Keys with the time from which messages are missing, s, monotonic."""
@@ -66,7 +65,7 @@ class Backfill:
         now = time.monotonic()
         with self._lock:
             for key, age_s in keys.items():
-                if "@cmd" not in key:
+                if _has_cache(key):
                     self._gaps[key] = min(now - age_s, self._gaps.get(key, now))
 
     def take_answers(self) -> list[zenoh.Sample]:
@@ -94,7 +93,7 @@ class Backfill:
             waiting_since = time.monotonic()
         now = time.monotonic()
         self._plan.add_gaps(self._take_gaps(), polls[0], now)
-        self._ask(self._plan.last_queries(now), until=now + MAX_CLOSE_S)
+        self._ask(self._plan.last_queries(), until=now + MAX_CLOSE_S)
 
     def _take_gaps(self) -> dict[str, float]:
         with self._lock:
@@ -116,7 +115,7 @@ class Backfill:
     def _recall(self, expression: str, since: float, answered: set[str]) -> bool:
         """Fetch the messages, and add their keys to `answered`. Return False if there was no room for all of them."""
         found: list[zenoh.Sample] = []
-        is_whole = True
+        is_whole, own = True, self._bus.id
         # Compute the window anew for each expression: on a bad network, the answers for one take seconds, and the
         # window of the next one would be too short.
         for sample in self._bus.recall(expression, time.monotonic() - since):
@@ -127,5 +126,10 @@ class Backfill:
         with self._lock:
             self._answers += found
         # A recorder publishes, too. Its own answer says nothing about the recorder of another site.
-        answered.update(str(each.key_expr) for each in found if session_of(each) != self._bus.id)
+        answered.update(str(each.key_expr) for each in found if session_of(each) != own)
         return is_whole
+
+
+def _has_cache(key: str) -> bool:
+    """Return False for a command stream: the clients that send it have no cache."""
+    return "@cmd" not in key

@@ -8,7 +8,7 @@ after the last command none comes. And the recorder asks at the start, if it con
 One query is not enough, because others may reconnect half a second later than we do, and on a loaded machine even
 later. So each cause plans several (`QUERY_AFTER_...`). Their answers overlap, but that does no harm: every message has
 a number, and the writer knows which ones it has. And a link that is back may be lost again before anybody was asked. So
-a source stays on the list until all keys with gaps were in an answer: it is asked again with its next cause, from the
+the plan keeps a source until its answers had all keys with gaps. It asks the source again with its next cause, from the
 time at which its first gap began, and once more at the end of the recording.
 
 How far back should it ask? The window of a query is relative ("the last 13 s"), and the publisher counts it back from
@@ -102,9 +102,9 @@ class BackfillPlan:
             [source for source, asked in self._asked.items() if asked.due and asked.due[0][0] <= now], now
         )
 
-    def last_queries(self, now: float) -> list[PlannedQuery]:
-        """Return the queries at the end of the recording: of all that may still be missing."""
-        return self._queries(list(self._asked), now, is_last=True)
+    def last_queries(self) -> list[PlannedQuery]:
+        """Return the queries at the end of the recording: of all that may still be missing. Plan nothing after it."""
+        return self._queries(self._asked, inf)
 
     def add_answers(self, query: PlannedQuery, answered: Collection[str]) -> None:
         """Take the keys that a whole answer has. Forget the sources that have answered their last query."""
@@ -130,12 +130,12 @@ class BackfillPlan:
         earliest = min([since, *(each for at, each in asked.due if at <= planned[-1][0])])
         asked.due = [(planned[0][0], earliest), *planned[1:], *(each for each in asked.due if each[0] > planned[-1][0])]
 
-    def _queries(self, sources: Collection[str], now: float, *, is_last: bool = False) -> list[PlannedQuery]:
+    def _queries(self, sources: Collection[str], now: float) -> list[PlannedQuery]:
         since: dict[str, float] = {}
         for source in sources:
             asked = self._asked[source]
-            served = [each for at, each in asked.due if is_last or at <= now]
-            asked.due = [each for each in asked.due if not (is_last or each[0] <= now)]
+            served = [each for at, each in asked.due if at <= now]
+            asked.due = [each for each in asked.due if each[0] > now]
             asked.asked_at = now
             since[source] = asked.unanswered_since = min([asked.unanswered_since, *served])
         if not since:

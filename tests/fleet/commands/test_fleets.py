@@ -27,7 +27,8 @@ def client() -> Iterator[Fleet]:
     with zenoh.open(router_config(endpoint)), Fleet(endpoint, "one", kind="person") as fleet:
         cars = (("one", "red"), ("one", "blue"), ("two", "red"), ("two", "green"))
         tokens = [fleet.bus.token(keys.car_token(name, car)) for name, car in cars]
-        status = pb.Supervision(processes=[pb.Supervised(name=name) for name in ("@hub", "red", "blue", "white")])
+        gateways = [pb.Supervised(name=name, kind="gateway") for name in ("red", "blue", "white")]
+        status = pb.Supervision(processes=[pb.Supervised(name="@hub", kind="hub"), *gateways])
 
         def answer(query: zenoh.Query) -> bool:
             reply_message(query, "one/@supervisor/status", status, as_json=False)

@@ -21,6 +21,12 @@ SECOND_NS = 1_000_000_000
 JSON = zenoh.Encoding("application/json")
 
 
+def alone() -> zenoh.Config:
+    """Return the configuration of a session that looks for no other."""
+    settings = {"scouting": {"multicast": {"enabled": False}}, "timestamping": {"enabled": True}}
+    return zenoh.Config.from_json5(json.dumps(settings))
+
+
 def feed(tape: SessionWriter, at_ns: int, count: int = 10, size: int = 1000) -> None:
     for number in range(count):
         tape.add("fleet/red/note", os.urandom(size).hex().encode(), JSON, None, None, at_ns + number)
@@ -169,7 +175,7 @@ def test_files_are_copied_into_each_session(tmp_path: Path) -> None:
 def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
     """While two sites are cut off from each other, the recorder of each publishes the status of the fleet."""
     tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
-    with zenoh.open(zenoh.Config.from_json5('{"scouting": {"multicast": {"enabled": false}}}')) as one:
+    with zenoh.open(alone()) as one:
         senders = [one.declare_publisher("fleet/@recorder/status").id for _ in range(2)]
     assert senders[0].eid != senders[1].eid
     for second, (sender, number) in enumerate([(0, 1), (1, 1), (1, 2), (1, 3), (0, 4), (1, 5)]):
@@ -185,10 +191,8 @@ def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
 
 
 def test_message_of_a_slow_clock_closes_its_gap(tmp_path: Path) -> None:
-    settings = {"scouting": {"multicast": {"enabled": False}}, "timestamping": {"enabled": True}}
     samples: list[zenoh.Sample] = []
-    config = zenoh.Config.from_json5(json.dumps(settings))
-    with zenoh.open(config) as one, one.declare_subscriber("fleet/red/note") as subscriber:
+    with zenoh.open(alone()) as one, one.declare_subscriber("fleet/red/note") as subscriber:
         out = one.declare_publisher("fleet/red/note", encoding=JSON)
         for number in range(3):
             out.put(b"{}", source_info=zenoh.SourceInfo(out.id, number))
