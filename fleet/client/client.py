@@ -377,7 +377,7 @@ class Fleet:
         def send_again(car: str) -> None:
             pool.submit(self._query, car, command, payload)
 
-        command = PendingCommand(command_id, request, self.cars(), named, lambda: self.bus.hubs, send_again)
+        command = PendingCommand(command_id, request, self.cars(), named, lambda: self.bus.link, send_again)
         self._pending[command_id] = command
         extra = json_log.fields(
             command_id=command_id, verb=request.verb, phase=Phase.ASKED, sender=message.sender, cars=command.targets

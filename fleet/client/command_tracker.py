@@ -22,8 +22,7 @@ SEND_AGAIN_INTERVAL_S: Final = 0.5
 """Interval at which a stop without an answer is sent again. A Zenoh session that has lost its hub tries to connect
 again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
-"""Interval at which a stop without an answer checks whether the bus is there. A Zenoh session that has lost its hub has
-no hub for at least twice this time, so no loss is overlooked."""
+"""Interval at which a stop without an answer checks whether the bus is there, or was lost meanwhile."""
 _MAX_QUEUED_ITEMS: Final = 4096
 """Maximum number of unread answers and events of a command. Each of up to some hundred cars sends a few."""
 
@@ -80,7 +79,7 @@ class PendingCommand:
         request: CommandRequest,
         present: list[str],
         named: list[str] | None,
-        hubs: Callable[[], tuple[str, ...]],
+        read_link: Callable[[], str],
         send_again: Callable[[str], None],
     ) -> None:
         self.id = command_id
@@ -90,8 +89,8 @@ class PendingCommand:
         self._send_again = send_again
         self._present = set(present)
         self._named = named
-        self._hubs = hubs
-        self._hubs_then = hubs()
+        self._read_link = read_link
+        self._link_then = read_link()
         self.is_taken: Future[bool] = Future()
         """True as soon as a gateway has answered, or no outcome is awaited any more. False if the bus was lost or the
         Fleet was closed before a gateway answered."""
@@ -139,7 +138,7 @@ class PendingCommand:
             if now >= waits_at:
                 self._say_waits(waiting)
             for progress in waiting:
-                if now >= progress.deadline and not progress.awaits_bus and self._hubs() != self._hubs_then:
+                if now >= progress.deadline and not progress.awaits_bus and self._read_link() != self._link_then:
                     progress.on_presence(now, alive=True)  # its gateway is not gone: our hub was lost
                 if now >= progress.deadline and self.inbox.empty():  # after a stall, its answer may be in the queue
                     progress.give_up(now)
@@ -182,13 +181,13 @@ class PendingCommand:
         Send the stop again to the cars without an answer.
         """
         unanswered = [each for each in self._progress.values() if each.outcome is None and not each.answered]
-        if not (hubs := self._hubs()):
+        if not (link := self._read_link()):
             if unanswered or not self._progress:
                 self.lost_bus, self._bus_back_at = True, None
             for progress in unanswered:
                 progress.on_bus_lost(now, self._asked_at + STOP_TTL_S)
             return
-        if hubs != self._hubs_then and unanswered:  # the hub was replaced, perhaps between two looks
+        if link != self._link_then and unanswered:  # the link was replaced, perhaps between two looks
             self.lost_bus = True
         if self.lost_bus and self._bus_back_at is None:
             self._bus_back_at = now

@@ -93,7 +93,7 @@ class Coordinator:
             for expression in keys.command_keys(fleet, keys.COORDINATOR, verb):
                 bus.queryable(expression, self._inbox.on_query)
         recheck_at: float | None = time.monotonic() + SINGLETON_RECHECK_S
-        hubs, hub_keeper = bus.hubs, HubKeeper(bus.endpoint, self.on_failure)
+        link, hub_keeper = bus.link, HubKeeper(bus.endpoint, self.on_failure)
         with ThreadPoolExecutor(max_workers=32) as pool:
             try:
                 self._drain_inbox(observer, pool, wait_s=0.0)
@@ -108,17 +108,17 @@ class Coordinator:
                 for query in self._early:
                     self._answer(query, observer)
                 while not has_ended():
-                    # Read the hubs before the inbox. If a hub is gone at that moment, the inbox says afterwards which
+                    # Read the link before the inbox. If it is gone at that moment, the inbox says afterwards which
                     # gateways were lost with it.
-                    linked_hubs = bus.hubs
+                    current_link = bus.link
                     self._drain_inbox(observer, pool)
                     now = time.monotonic()
                     self._check_sleep(observer, now)
-                    hub_keeper.check(connected=bool(linked_hubs))
-                    if not linked_hubs:
+                    hub_keeper.check(connected=bool(current_link))
+                    if not current_link:
                         continue
-                    if linked_hubs != hubs:
-                        hubs, self._memory = linked_hubs, on_hub_back(self._memory, now)
+                    if current_link != link:
+                        link, self._memory = current_link, on_hub_back(self._memory, now)
                     try:
                         self._step(observer, pool, now)
                     except OSError:  # our own output is closed, because the parent process has ended

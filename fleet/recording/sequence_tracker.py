@@ -4,6 +4,7 @@ The recorder uses `SequenceTracker` to request backfills, `sessions verify` uses
 """
 
 from collections.abc import Hashable
+from math import inf
 from typing import Final
 
 from msgspec import Struct, field
@@ -62,6 +63,8 @@ class TrackedSender(Struct):
     """When the newest message was received, ns. 0 if none was."""
     gaps: list[Gap] = field(default_factory=list)
     """Gaps that a backfill may still close."""
+    earlier_gaps: list[Gap] = field(default_factory=list)
+    """Gaps of the session before this one. Its writer shares this list, and may still fill them by a backfill."""
 
 
 class SequenceTracker:
@@ -77,6 +80,20 @@ class SequenceTracker:
         self.senders: dict[Hashable, TrackedSender] = {}
         self._early: dict[tuple[Hashable, int], int] = {}
         self._lost = 0
+
+    def following(self) -> "SequenceTracker":
+        """Return the tracker of the session that follows this one without a pause.
+
+        It notices a gap between the two sessions, and takes no message that this one has. The gaps of this one are
+        missing only here.
+        """
+        tracker = SequenceTracker()
+        tracker._early = self._early
+        tracker.senders = {
+            name: TrackedSender(sender.last, sender.first, sender.heard_ns, earlier_gaps=sender.gaps)
+            for name, sender in self.senders.items()
+        }
+        return tracker
 
     @property
     def missing(self) -> int:
@@ -97,7 +114,8 @@ class SequenceTracker:
         if self._early.get((sender, number)) == published_ns:
             del self._early[sender, number]
             return False
-        if _fill(known.gaps, number):  # it fills a gap: a newer backfilled message came before it
+        # If it fills a gap, a newer backfilled message came before it.
+        if _fill(known.gaps, number) or _fill(known.earlier_gaps, number):
             return True
         self._restart(known, number)  # the sender restarted its count, so this is not a gap of four billion messages
         return True
@@ -145,14 +163,17 @@ class SequenceTracker:
     def _begin(self, sender: Hashable, number: int) -> TrackedSender:
         """Add a sender. Messages before its first number precede this recording, and are not a gap."""
         if len(self.senders) >= MAX_TRACKED_SOURCES:
-            oldest = self.senders.pop(next(iter(self.senders)))
-            self._lost += sum(gap.count for gap in oldest.gaps)
+            # Forget the sender that has been silent for the longest time. A sender that was only backfilled lives: its
+            # cache has just answered.
+            oldest = min(self.senders, key=lambda each: self.senders[each].heard_ns or inf)
+            self._lost += sum(gap.count for gap in self.senders.pop(oldest).gaps)
         self.senders[sender] = known = TrackedSender(number, number)
         return known
 
     def _restart(self, known: TrackedSender, number: int) -> None:
         self._lost += sum(gap.count for gap in known.gaps)
         known.gaps.clear()
+        known.earlier_gaps = []
         known.last = known.first = number
 
     def _skip(self, known: TrackedSender, below: int, distance: int) -> None:

@@ -23,16 +23,16 @@ class LinkChecks:
     """Decides when to look for the token, and when its absence means that the certificate was revoked. Pure."""
 
     def __init__(self) -> None:
-        self._checked: tuple[str, ...] = ()
-        self._silent: tuple[str, ...] = ()
+        self._checked = ""
+        self._silent = ""
         self._silences = 0
 
-    def is_due(self, hubs: tuple[str, ...]) -> bool:
-        """Return True while it is not known whether these hubs, as `Bus.hubs` names them, pass anything on."""
-        return bool(hubs) and hubs != self._checked
+    def is_due(self, link: str) -> bool:
+        """Return True while it is not known whether anything is passed on over this link (see `Bus.link`)."""
+        return bool(link) and link != self._checked
 
-    def take(self, before: tuple[str, ...], after: tuple[str, ...], *, found: bool | None) -> bool:
-        """Take the hubs before and after one look, and what it has found. Return True if the certificate is revoked.
+    def take(self, before: str, after: str, *, found: bool | None) -> bool:
+        """Take the links before and after one look, and what it has found. Return True if the certificate is revoked.
 
         `found` is the result of `passes_on`.
         """
@@ -59,9 +59,9 @@ class RevocationWatch:
         checks = LinkChecks()
         while True:
             await asyncio.sleep(TOKEN_LOOK_INTERVAL_S)
-            hubs = self._bus.hubs
-            if not checks.is_due(hubs):
+            link = self._bus.link
+            if not checks.is_due(link):
                 continue
             found = await asyncio.to_thread(passes_on, self._bus, self._token, TOKEN_LOOK_S)
-            if checks.take(hubs, self._bus.hubs, found=found):
+            if checks.take(link, self._bus.link, found=found):
                 on_revoked()

@@ -27,12 +27,15 @@ class SessionLink:
 
     @property
     def address(self) -> str:
-        """Address of our end, which no two links share. Empty while messages reach no hub."""
+        """Address of our end, which no two links share. Empty while messages reach no hub, and of a closed session."""
         with self._reading:
-            while (event := self._next_event()) is not None:
-                if event.kind == zenoh.SampleKind.PUT:
-                    self._opened = str(event.link.src)
-                elif self._opened == str(event.link.src):
-                    self._opened = ""
-            is_listed = any(str(link.src) == self._opened for link in self._session.info.links())
+            try:
+                while (event := self._next_event()) is not None:
+                    if event.kind == zenoh.SampleKind.PUT:
+                        self._opened = str(event.link.src)
+                    elif self._opened == str(event.link.src):
+                        self._opened = ""
+                is_listed = any(str(link.src) == self._opened for link in self._session.info.links())
+            except zenoh.ZError:  # the session is closed, perhaps by another thread just now
+                return ""
             return self._opened if is_listed else ""

@@ -497,11 +497,6 @@ class Bus:
         """The link to the hub: a text that no two links share. Empty while messages reach no hub."""
         return self._link.address
 
-    @property
-    def hubs(self) -> tuple[str, ...]:
-        """The ids of the linked routers. A restarted hub has another id."""
-        return tuple(sorted(str(hub) for hub in self._session.info.routers_zid()))
-
     def put_command(self, key: str, payload: bytes, encoding: str, sequence: int = 1) -> None:
         """Publish one command of a stream (drive). `sequence` is its number within the stream, from 1."""
         self.put_again(key, payload, encoding, sequence, Qos.COMMAND)

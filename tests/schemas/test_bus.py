@@ -175,6 +175,18 @@ def test_tokens_while_link_ends_and_next_one_opens(endpoint: str) -> None:
             assert watcher.tokens("*/*") == THERE
 
 
+def test_each_link_has_a_text_of_its_own(endpoint: str) -> None:
+    proxy = TcpProxy(int(endpoint.rpartition(":")[2]))
+    with watcher_behind(proxy, endpoint) as watcher:
+        links = [watcher.link]
+        for _ in range(3):
+            proxy.hang_up()
+            wait_for(lambda: watcher.link not in ("", *links))
+            links.append(watcher.link)
+    assert all(links)
+    assert watcher.link == "", "it is closed"
+
+
 def test_tokens_of_all_fleets_while_watching_one(endpoint: str) -> None:
     """Zenoh leaves watched tokens out of some answers, so one of two fleets was not there, and a stop missed it."""
     there = {"fleet/red", "two/red"}

@@ -44,6 +44,7 @@ class Backfill:
         """Keys with the time from which messages are missing, s, monotonic."""
         self._answers: list[zenoh.Sample] = []
         self._closing = threading.Event()
+        self._max_close_s = MAX_CLOSE_S
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
         self._plan = BackfillPlan(now, resume_since=now - RESUME_WINDOW_S if resumes else None)
@@ -53,9 +54,19 @@ class Backfill:
         self._thread.start()
 
     def close(self) -> None:
-        """Ask one last time for the messages that are still missing, and end the thread."""
-        self._closing.set()
+        """Ask one last time for the messages that are still missing, and wait for the end of the thread."""
+        self.end(MAX_CLOSE_S)
         self._thread.join()
+
+    def end(self, within_s: float) -> None:
+        """Let the thread ask one last time, and end. `within_s`: maximum time after which a last query begins."""
+        self._max_close_s = min(within_s, self._max_close_s)
+        self._closing.set()
+
+    @property
+    def is_running(self) -> bool:
+        """True until the last query is answered."""
+        return self._thread.is_alive()
 
     def request(self, keys: Mapping[str, float]) -> None:
         """Request a backfill of these keys. Each value is the age, in s, of the last message before the gap.
@@ -93,7 +104,7 @@ class Backfill:
             waiting_since = time.monotonic()
         now = time.monotonic()
         self._plan.add_gaps(self._take_gaps(), polls[0], now)
-        self._ask(self._plan.last_queries(), until=now + MAX_CLOSE_S)
+        self._ask(self._plan.last_queries(), until=now + self._max_close_s)
 
     def _take_gaps(self) -> dict[str, float]:
         with self._lock:

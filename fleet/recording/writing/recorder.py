@@ -60,6 +60,9 @@ both waits are repeated."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
+MAX_GAP_WAIT_S: Final = 8.0
+"""Maximum time for which a session that is over waits for the messages in its gaps. A last query may take 5 s more, and
+clients wait 15 s for the answer to `stop`."""
 
 
 class RecordingFailed(Exception):
@@ -129,12 +132,18 @@ class Recorder:
         self._queued_messages = 0
         self._queued_bytes = 0
         self._queries: list[tuple[zenoh.Query, str]] = []
+        self._stops: list[tuple[zenoh.Query, str]] = []
+        """Requests to stop, which are answered when the session is closed."""
+        self._is_closing = False
         self._closing = threading.Event()
         self._reader_done = threading.Event()
         self._reader_error: Exception | None = None
         self._subscribers: list[SampleChannel] = []
         self._error = ""
         self._recording = True
+        self._earlier: SessionWriter | None = None
+        """The session before this one, while it waits for the messages in its gaps."""
+        self._earlier_until = 0.0
         self.ended = threading.Event()
         """Set when the writer has closed the session or failed."""
 
@@ -152,9 +161,7 @@ class Recorder:
         session = self._session.path
         self._service.declare_publishers()
         self._last = self._status()
-        self._backfill = Backfill(
-            self._bus, keys.recorded_keys(self._fleet), resumes=bool(self._session.description.continues)
-        )
+        self._backfill = self._new_backfill()
         self._reader = threading.Thread(target=self._read, name="bus-reader")
         self._writer = threading.Thread(target=self._write, name="mcap-writer")
         self._reader.start()
@@ -172,6 +179,8 @@ class Recorder:
         """Write all received messages, and close the session. Raises RecordingFailed if that fails."""
         if not self.ended.is_set():
             self._await_messages_in_transit()
+        with self._lock:
+            self._is_closing = True
         self._backfill.close()
         self._closing.set()
         self._reader.join()
@@ -185,6 +194,10 @@ class Recorder:
         return RecordingOutcome(
             session.path, session.messages, session.bytes, dict(session.drops), session.missed, session.cost
         )
+
+    def _new_backfill(self) -> Backfill:
+        recorded = keys.recorded_keys(self._fleet)
+        return Backfill(self._bus, recorded, resumes=bool(self._session.description.continues))
 
     def _await_messages_in_transit(self) -> None:
         began = time.monotonic()
@@ -267,10 +280,12 @@ class Recorder:
                     due = max(due + FLUSH_INTERVAL_S, time.monotonic())
                     self._tick()
                 self._answer()
+                self._finish_stop()
             self._drain()
             if self._reader_error is not None:
                 self._fail(f"{type(self._reader_error).__name__}: {self._reader_error}")
                 return
+            self._end_earlier()
             if self._recording:
                 self._end_session(self._session)
             self._publish(RecorderState.CLOSED)
@@ -281,6 +296,7 @@ class Recorder:
         finally:
             self.ended.set()
             self._answer()
+            self._finish_stop()
 
     def _drain(self) -> None:
         with self._lock:
@@ -329,7 +345,9 @@ class Recorder:
     def _add_backfilled(self, samples: Sequence[zenoh.Sample]) -> None:
         late: list[tuple[int, str, str, bytes]] = []
         for sample in samples:
-            new, key = self._session.add_backfilled(sample, self._now()), str(sample.key_expr)
+            now_ns, key = self._now(), str(sample.key_expr)
+            fills_earlier = self._earlier is not None and self._earlier.fill_gap(sample, now_ns)
+            new = fills_earlier or self._session.add_backfilled(sample, now_ns)
             if new and sample.timestamp is not None and self._pin_watch.is_watched(key):
                 published_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
                 late.append((published_ns, key, str(sample.encoding), sample.payload.to_bytes()))
@@ -342,14 +360,17 @@ class Recorder:
         if self._recording:
             session.tick(self._now())
             if session.over and not session.full:
-                self._begin_session()
-                self._end_session(session)
+                self._begin_session(after=session)
+                self._end_earlier()
+                self._earlier, self._earlier_until = session, time.monotonic() + MAX_GAP_WAIT_S
+            if self._earlier and (not self._earlier.can_be_filled or time.monotonic() >= self._earlier_until):
+                self._end_earlier()
         self._report_news(self._session)
         self._publish()
 
-    def _begin_session(self) -> None:
-        """Begin the next session. Raises OSError if it cannot be created."""
-        self._session = SessionWriter(self._root, self._fleet, self._options, self._now())
+    def _begin_session(self, after: SessionWriter | None = None) -> None:
+        """Begin the next session, which follows `after` without a pause. Raises OSError if it cannot be created."""
+        self._session = SessionWriter(self._root, self._fleet, self._options, self._now(), after=after)
         if not self._session.full:
             self._notify(f"recording {keys.describe_fleet(self._fleet)} to {self._session.path}")
 
@@ -357,6 +378,12 @@ class Recorder:
         """Close a session, and report its last news."""
         session.close(self._now())
         self._report_news(session)
+
+    def _end_earlier(self) -> None:
+        """Close the session before this one, if it still waits for messages."""
+        if self._earlier is not None:
+            earlier, self._earlier = self._earlier, None
+            self._end_session(earlier)
 
     def _report_news(self, session: SessionWriter) -> None:
         """Report removals by the quota, failed copies, and each new state once."""
@@ -390,6 +417,8 @@ class Recorder:
             self._session.messages,
         )
         self._last.drops.update(self._session.drops)
+        with contextlib.suppress(OSError):  # the error of this session is the one to report
+            self._end_earlier()
         with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report the failure
             self._service.publish(self._last, self._now())
 
@@ -427,14 +456,22 @@ class Recorder:
         with self._lock:
             queries, self._queries = self._queries, []
         for query, key in queries:
-            with query:
+            with contextlib.ExitStack() as answered:
+                answered.enter_context(query)
                 verb = key.rpartition("/")[2] if "/@cmd/" in key else RecorderVerb.STATUS
                 try:
                     self._handle(verb, query)
                 except _CommandRefused as refused:
                     query.reply_err(str(refused), encoding="text/plain")
+                    continue
+                if verb == RecorderVerb.STOP:
+                    answered.pop_all()
+                    self._stops.append((query, key))
                 else:
-                    reply_value(query, key, self._last.SerializeToString(), STATUS_TOPIC)
+                    self._reply(query, key)
+
+    def _reply(self, query: zenoh.Query, key: str) -> None:
+        reply_value(query, key, self._last.SerializeToString(), STATUS_TOPIC)
 
     def _handle(self, verb: str, query: zenoh.Query) -> None:
         if self.ended.is_set() and verb != RecorderVerb.STATUS:
@@ -445,7 +482,7 @@ class Recorder:
                 self._start_session()
             case RecorderVerb.STOP:
                 self._check_sender(query, verb)
-                self._stop_session()
+                self._begin_stop()
             case RecorderVerb.MARK:
                 self._mark(query)
             case RecorderVerb.STATUS:
@@ -480,6 +517,8 @@ class Recorder:
         return People.merged(Authority.of(each).people for each in messages_of(states))
 
     def _start_session(self) -> None:
+        if self._stops:
+            raise _CommandRefused(f"{self._session.path} is being closed: ask again in a moment.")
         if self._recording:
             raise _CommandRefused(
                 f"{keys.describe_fleet(self._fleet).capitalize()} is recorded already, to {self._session.path}"
@@ -488,19 +527,36 @@ class Recorder:
             self._begin_session()
         except OSError as error:
             raise _CommandRefused(f"No session can be made in {self._root}: {error.strerror}") from None
+        with self._lock:
+            if not self._is_closing:
+                self._backfill = self._new_backfill()
+                self._backfill.start()
         self._recording = True
         self._pin_watch = PinWatch(self._pin_rules)  # begin anew: between the sessions, no message was watched
         self._publish()
 
-    def _stop_session(self) -> None:
+    def _begin_stop(self) -> None:
+        """Ask for missing messages one last time. The session records until the answers have come."""
         if not self._recording:
             raise _CommandRefused(f"Nothing is being recorded. The last session is {self._session.path}.")
-        self._drain()
-        self._end_session(self._session)
-        self._recording = False
-        losses = f"; {self._session.cost}" if self._session.cost else ""
-        self._notify(f"{self._session.path} is closed by request{losses}")
-        self._publish()
+        self._backfill.end(MAX_GAP_WAIT_S)
+
+    def _finish_stop(self) -> None:
+        """Close the session if a stop was requested, and the last answers have come. Answer the request."""
+        if not self._stops or (self._backfill.is_running and not self.ended.is_set()):
+            return
+        if self._recording and not self.ended.is_set():
+            self._drain()
+            self._end_earlier()
+            self._end_session(self._session)
+            self._recording = False
+            losses = f"; {self._session.cost}" if self._session.cost else ""
+            self._notify(f"{self._session.path} is closed by request{losses}")
+            self._publish()
+        stops, self._stops = self._stops, []
+        for query, key in stops:
+            with query:
+                self._reply(query, key)
 
     def _mark(self, query: zenoh.Query) -> None:
         if not self._recording:

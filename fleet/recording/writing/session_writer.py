@@ -66,14 +66,18 @@ class SessionWriter:
 
     A full disk is not an error: `full` names it, new messages are buffered, and writing resumes when there is space.
     If the disk is full from the start, `path` is the future directory of the session.
+
+    `after` is the session that this one follows without a pause, if there is one.
     """
 
-    def __init__(self, root: Path, fleet: str, options: Options, now_ns: int) -> None:
+    def __init__(
+        self, root: Path, fleet: str, options: Options, now_ns: int, *, after: "SessionWriter | None" = None
+    ) -> None:
         self._root = root
         self._options = options
         self.path, self.description = session_dir.plan(root, fleet, _utc(now_ns))
         self._made = False
-        resume_point = resume.find_interrupted(root, fleet, now_ns)
+        resume_point = resume.find_interrupted(root, fleet, now_ns) if after is None else after._end_point()
         self.description.continues = resume_point.name
         self._resume_since_ns, self._recorded = resume_point.since_ns, resume_point.known
         self._metadata = {"fleet": fleet, "started": self.description.started, "host": self.description.host}
@@ -81,11 +85,15 @@ class SessionWriter:
         self.uncopied: list[str] = []
         """Files that could not be copied. The recorder reports and clears them."""
         self._trackers: dict[str, SequenceTracker] = {}
+        """What was received of each key, also by the session before."""
         self._irregular_keys: set[str] = set()
         """Keys whose sequence numbers were not always consecutive."""
         self.gaps: dict[str, int] = {}
         """Keys with new gaps, each with the time of the sender's last message before the gap (0 if there was none). The
         recorder requests a backfill for them and clears them."""
+        if after is not None:
+            self._trackers = {key: tracker.following() for key, tracker in after._trackers.items()}
+            self.gaps = after.gaps
         self._drops: dict[str, int] = {}
         """Lost messages by key: those that did not fit on the disk, and those without a number that did not fit into
         the queue."""
@@ -178,6 +186,23 @@ class SessionWriter:
             self.recovered[key] = self.recovered.get(key, 0) + 1
         self._write((state, received_ns, sample.payload.to_bytes(), published_ns, sequence))
         return True
+
+    @property
+    def can_be_filled(self) -> bool:
+        """True if messages are missing that `fill_gap` can still write."""
+        return self._segment is not None and not self.full and bool(self.missed)
+
+    def fill_gap(self, sample: zenoh.Sample, received_ns: int) -> bool:
+        """Write a backfilled publication if it is missing. Return False if it is not, or belongs to no gap."""
+        tracker, source = self._trackers.get(str(sample.key_expr)), sample.source_info
+        if tracker is None or source is None:
+            return False
+        sender = (source.source_id.zid, source.source_id.eid)
+        return tracker.is_missing(sender, sequence_of(source)) and self.add_backfilled(sample, received_ns)
+
+    def _end_point(self) -> resume.ResumePoint:
+        """Return where the session begins that follows this one."""
+        return resume.ResumePoint(self.path.name if self._made else "", self._resume_since_ns, self._recorded)
 
     def _write(self, row: Row) -> None:
         self._unflushed.append(row)

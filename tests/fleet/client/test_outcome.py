@@ -225,7 +225,7 @@ def test_reason_of_waiting_is_known_until_frame_is_sent() -> None:
 
 def test_waiting_command_is_explained_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     monkeypatch.setattr(command_tracker, "WAIT_SAID_S", 0.0)
-    pending = PendingCommand("it", mode_request("tracking"), ["red"], ["red"], tuple, lambda car: None)
+    pending = PendingCommand("it", mode_request("tracking"), ["red"], ["red"], str, lambda car: None)
     for phase, words in (("queued", "opens later"), ("queued", "opens later"), ("sent", "")):
         event = pb.CommandEvent(car="red", phase=phase, words=words)
         pending.inbox.put((time.monotonic(), event))
@@ -236,7 +236,7 @@ def test_waiting_command_is_explained_once(monkeypatch: pytest.MonkeyPatch, capl
 
 def test_car_that_was_not_asked_has_no_outcome() -> None:
     """Its gateway got the command from that of the named car, which forwards the end of an e-stop of the fleet."""
-    pending = PendingCommand("it", resume_request(["x"]), ["red", "blue"], ["red"], tuple, lambda car: None)
+    pending = PendingCommand("it", resume_request(["x"]), ["red", "blue"], ["red"], str, lambda car: None)
     for car, phase in (("blue", "rejected"), ("red", "sent")):
         pending.inbox.put((time.monotonic(), pb.CommandEvent(car=car, phase=phase)))
     pending.inbox.put((time.monotonic(), QueryEnded("red", "")))

@@ -109,6 +109,46 @@ def test_each_message_is_taken_once_for_random_loss_and_backfill(lost: set[int],
     assert numbers.missing == 0
 
 
+def test_sender_that_is_silent_for_longest_is_forgotten_first() -> None:
+    numbers = SequenceTracker()
+    for at_ns in range(1, MAX_TRACKED_SOURCES * 3):
+        live(numbers, 1, sender=str(at_ns))
+        numbers.senders[str(at_ns)].heard_ns = at_ns
+        live(numbers, at_ns, sender="gateway")
+        numbers.senders["gateway"].heard_ns = at_ns
+        assert numbers.add_backfilled("other site", at_ns, 0)
+    assert {"gateway", "other site"} <= numbers.senders.keys()
+    assert not numbers.add_backfilled("gateway", 1, 10)
+
+
+@given(st.sets(st.integers(1, 60)), st.integers(0, 2**32))
+def test_each_message_is_taken_once_by_the_sessions_of_one_recording(lost: set[int], seed: int) -> None:
+    """The session before takes what it lacks. What only older ones lack is missing there."""
+    chance, taken = random.Random(seed), []
+    trackers = [SequenceTracker(), SequenceTracker()]
+
+    def backfilled(first: int, last: int) -> list[int]:
+        found = []
+        for old in range(first, last + 1):
+            before, now = trackers[-2:]
+            own = before if before.is_missing("a", old) else now
+            if chance.random() < 0.9:  # else the answer is cut off
+                found += [old] if own.add_backfilled("a", old, old * 10) else []
+        return found
+
+    for number in range(1, 61):
+        if number not in lost and all(live(trackers[-1], number)):
+            taken.append(number)
+        if chance.random() < 0.1:
+            taken += backfilled(max(1, number - 20), min(60, number + chance.randrange(4)))  # some are still on the way
+        if chance.random() < 0.1:
+            trackers.append(trackers[-1].following())
+    while trackers[-1].missing or trackers[-1].senders["a"].last < 60:
+        taken += backfilled(1, 60)
+    assert sorted(taken) == sorted(set(taken))
+    assert len(taken) + sum(each.missing for each in trackers) == 60
+
+
 @given(st.sets(st.integers(2, 60)), st.integers(0, 2**32))
 def test_queue_overflow_counts_as_missing_including_last(dropped: set[int], seed: int) -> None:
     """The recorder reports what it dropped now and then, also after later ones came."""

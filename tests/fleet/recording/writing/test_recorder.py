@@ -16,13 +16,17 @@ from google.protobuf import descriptor_pool, message_factory
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
+from fleet.client.services import ask_recorder
+from fleet.quota import Quota
 from fleet.recording.writing.backfill import BACKFILL_POLL_INTERVAL_S, LEASE_POLLS
 from fleet.recording.writing.recorder import Recorder
 from fleet.recording.writing.recorder_service import AnotherRecorder
+from fleet.recording.writing.session_writer import Options
 from schemas import keys, messages
 from schemas.bus import Bus, Sample, router_config
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
+from schemas.words import RecorderState, RecorderVerb
 from tests.fleet.recording.conftest import heard, publisher, wait_for
 from tests.support.ports import free_endpoint
 from tests.support.tap import Tap
@@ -157,13 +161,13 @@ def test_messages_of_cut_off_car_are_backfilled(endpoint: str, bus: Bus, tmp_pat
         events.put(pb.CommandEvent(verb="stop"), time.time_ns())
         heard(car._session)
         tap.reset()
-        wait_for(lambda: not car.hubs, "the car is cut off")
+        wait_for(lambda: not car.link, "the car is cut off")
         for _ in range(20):
             ranges.put(pb.Range(range_m=2.0), time.time_ns())
         events.put(pb.CommandEvent(verb="estop"), time.time_ns())
         time.sleep(2 * LEASE_POLLS * BACKFILL_POLL_INTERVAL_S)  # not a wait: how long it is cut off
         tap.accept()
-        wait_for(lambda: car.hubs, "the car is back")
+        wait_for(lambda: car.link, "the car is back")
         ranges.put(pb.Range(range_m=3.0), time.time_ns())
         heard(car._session)
         outcome = recorder.close()
@@ -171,6 +175,102 @@ def test_messages_of_cut_off_car_are_backfilled(endpoint: str, bus: Bus, tmp_pat
     held = Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))
     assert held["fleet/red/sensor/range"] == 22
     assert held["fleet/red/event/command"] == 2
+
+
+def cut_off(car: Bus, tap: Tap) -> None:
+    tap.reset()
+    wait_for(lambda: not car.link, "the car is cut off")
+
+
+def back(car: Bus, tap: Tap) -> None:
+    tap.accept()
+    wait_for(lambda: car.link, "the car is back")
+
+
+def recorded_numbers(root: Path, key: str) -> list[list[int]]:
+    """Return the numbers of the messages under a key, in each session."""
+    found = []
+    for session in sorted(root.iterdir()):
+        rows = [row for segment in sorted(session.glob("*.mcap")) for row in stock(segment)]
+        found.append([message.sequence for _, channel, message in rows if channel.topic == key])
+    return found
+
+
+def test_stop_waits_for_missed_messages(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    tap = Tap(endpoint.replace("tcp/", "tcp://"))
+    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+        recorder = Recorder(own, "fleet", tmp_path)
+        recorder.start()
+        ranges = publisher(car, "red", "sensor/range")
+        ranges.put(pb.Range(range_m=1.0), time.time_ns())
+        heard(car._session)
+        cut_off(car, tap)
+        ranges.put(pb.Range(range_m=2.0), time.time_ns())
+        back(car, tap)
+        ranges.put(pb.Range(range_m=3.0), time.time_ns())
+        heard(car._session)
+        found = ask_recorder(bus, "fleet", RecorderVerb.STOP)
+        assert found is not None
+        assert (found.state, dict(found.missed)) == (RecorderState.STOPPED, {})
+        (first,) = recorded_numbers(tmp_path, ranges.key)
+        assert sorted(first) == [1, 2, 3]
+        cut_off(car, tap)
+        ranges.put(pb.Range(range_m=4.0), time.time_ns())
+        back(car, tap)
+        assert ask_recorder(bus, "fleet", RecorderVerb.START) is not None
+        ranges.put(pb.Range(range_m=5.0), time.time_ns())
+        heard(car._session)
+        outcome = recorder.close()
+    assert outcome.missed == {}, "nobody recorded between the two sessions"
+    assert recorded_numbers(tmp_path, ranges.key) == [first, [5]]
+
+
+def test_messages_that_are_lost_between_two_sessions_are_backfilled(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    tap = Tap(endpoint.replace("tcp/", "tcp://"))
+    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+        recorder = Recorder(own, "fleet", tmp_path, Options(quota=Quota(session=100_000)))
+        recorder.start()
+        ranges = publisher(car, "red", "sensor/range")
+        ranges.put(pb.Range(range_m=1.0), time.time_ns())
+        heard(car._session)
+        cut_off(car, tap)
+        ranges.put(pb.Range(range_m=2.0), time.time_ns())
+        bus.put_command("fleet/blue/@cmd/drive", os.urandom(200_000), "application/json", 1)
+        wait_for(lambda: len(list(tmp_path.iterdir())) == 2, "the next session")
+        ranges.put(pb.Range(range_m=3.0), time.time_ns())
+        back(car, tap)
+        ranges.put(pb.Range(range_m=4.0), time.time_ns())
+        heard(car._session)
+        outcome = recorder.close()
+    assert outcome.missed == {}
+    first, second = recorded_numbers(tmp_path, ranges.key)
+    assert (first, sorted(second)) == ([1], [2, 3, 4])
+
+
+def test_session_that_is_over_waits_for_its_missed_messages(
+    endpoint: str, bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fleet.recording.writing.backfill.BACKFILL_POLL_INTERVAL_S", 60.0)  # asks only at the end
+    tap = Tap(endpoint.replace("tcp/", "tcp://"))
+    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+        recorder = Recorder(own, "fleet", tmp_path, Options(quota=Quota(session=100_000)))
+        first = recorder.start()
+        ranges = publisher(car, "red", "sensor/range")
+        ranges.put(pb.Range(range_m=1.0), time.time_ns())
+        heard(car._session)
+        cut_off(car, tap)
+        ranges.put(pb.Range(range_m=2.0), time.time_ns())
+        back(car, tap)
+        ranges.put(pb.Range(range_m=3.0), time.time_ns())
+        wait_for(lambda: recorder._session.missed, "the gap")
+        bus.put_command("fleet/blue/@cmd/drive", os.urandom(200_000), "application/json", 1)
+        wait_for(lambda: len(list(tmp_path.iterdir())) == 2, "the next session")
+        ranges.put(pb.Range(range_m=4.0), time.time_ns())
+        heard(car._session)
+        recorder.close()
+    assert recorded_numbers(tmp_path, ranges.key) == [[1, 3, 2], [4]]
+    description = json.loads((first / "session.json").read_text())
+    assert (description["closed"], description["missed"], description["recovered"]) == (True, {}, {ranges.key: 1})
 
 
 @pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])

@@ -190,14 +190,50 @@ def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
     tape.close(BEGUN_NS + 9 * SECOND_NS)
 
 
-def test_message_of_a_slow_clock_closes_its_gap(tmp_path: Path) -> None:
+def published(count: int) -> list[zenoh.Sample]:
+    """Return samples of one publisher, numbered from 1."""
     samples: list[zenoh.Sample] = []
     with zenoh.open(alone()) as one, one.declare_subscriber("fleet/red/note") as subscriber:
         out = one.declare_publisher("fleet/red/note", encoding=JSON)
-        for number in range(3):
-            out.put(b"{}", source_info=zenoh.SourceInfo(out.id, number))
+        for number in range(count):
+            out.put(str(number + 1), source_info=zenoh.SourceInfo(out.id, number))
             samples.append(subscriber.recv())
-    first, second, third = samples
+    return samples
+
+
+def numbers(path: Path) -> list[int]:
+    return [message.sequence for message in Session(path).messages()]
+
+
+def test_next_session_notices_what_is_lost_between_two(tmp_path: Path) -> None:
+    samples = published(6)
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    for at in (0, 2):
+        tape.add("fleet/red/note", b"{}", JSON, samples[at].timestamp, samples[at].source_info, BEGUN_NS)
+    after = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS + SECOND_NS, after=tape)
+    assert after.gaps == {"fleet/red/note": BEGUN_NS}, "the gap of the first session is still requested"
+    after.gaps.clear()
+    last = samples[5]
+    after.add("fleet/red/note", b"{}", JSON, last.timestamp, last.source_info, BEGUN_NS + 2 * SECOND_NS)
+    assert after.gaps == {"fleet/red/note": BEGUN_NS}
+    assert (tape.missed, after.missed) == ({"fleet/red/note": 1}, {"fleet/red/note": 2})
+    assert tape.can_be_filled
+    for each in samples:
+        assert (tape.fill_gap(each, BEGUN_NS) or after.add_backfilled(each, BEGUN_NS)) == (
+            each in samples[1:5:2] + samples[4:5]
+        )
+    assert (tape.missed, after.missed, tape.can_be_filled) == ({}, {}, False)
+    tape.close(BEGUN_NS + 9 * SECOND_NS)
+    after.close(BEGUN_NS + 9 * SECOND_NS)
+    assert (numbers(tape.path), numbers(after.path)) == ([1, 3, 2], [6, 4, 5])
+    assert after.description.continues == tape.path.name
+    for writer in (tape, after):
+        verdict = verify(Session(writer.path))
+        assert verdict.whole, list(verdict.words())
+
+
+def test_message_of_a_slow_clock_closes_its_gap(tmp_path: Path) -> None:
+    first, second, third = published(3)
     assert first.timestamp is not None
     late_ns = first.timestamp.get_time_as_ntp64().as_nanos() + 3600 * SECOND_NS
     tape = SessionWriter(tmp_path / "late", "fleet", Options(), late_ns)
