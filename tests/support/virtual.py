@@ -5,6 +5,7 @@ Control checks silence as often as in a gateway. Bytes, deadlines and events of 
 
 import random
 from collections.abc import Callable
+from itertools import pairwise
 
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.control_output import CommandRecord, LogRecord
@@ -147,6 +148,12 @@ class Pair:
         time, left, right = self.car.motor_log[-1]
         assert (left, right) == (0, 0), f"the motors are on since {time}: {self.sent[-6:]}"
         return time
+
+    def driven_since(self, begin: float) -> float:
+        """Return for how many seconds the motors were on after a time, by the run until now."""
+        changes = [*self.car.motor_log, (self.now, 0, 0)]
+        on = [(at, until) for (at, left, right), (until, *_) in pairwise(changes) if left or right]
+        return sum(max(0.0, until - max(at, begin)) for at, until in on)
 
     def phases(self, identity: str) -> list[Phase]:
         """Return the phases of one command."""
