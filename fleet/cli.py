@@ -12,7 +12,7 @@ from typing import Final
 import click
 from click.shell_completion import BashComplete, FishComplete, add_completion_class
 
-from fleet.commands.group import CommandGroup, as_option, connect_option, fleet_option
+from fleet.commands.command_group import CommandGroup, as_option, connect_option, fleet_option
 from schemas import commands
 from schemas.printable import printable_lines
 from schemas.process import startup, stdio

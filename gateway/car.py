@@ -36,16 +36,16 @@ from gateway.link import LinkError, LinkUrl
 from gateway.link_loop import LinkLoop, at_rate
 from gateway.safety_state_file import SafetyStateFile
 from gateway.stop_without_hub import stop_alone
-from gateway.wake import Wake
 from gateway.writer import Writer
+from gateway.writer_wakeup import WriterWakeup
 from schemas import bus
 from schemas.keys import car_token
 from schemas.limits import DEFAULT_MAX_DRIVE_S, SHUTDOWN_S
 from schemas.links import car_link
 from schemas.process import json_log, signals
+from schemas.process.computer_sleep import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.process.parent import has_ended
 from schemas.process.service_notifier import ServiceNotifier
-from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.rights import NO_PEOPLE, People
 from schemas.running_cars import RunningMark
 from schemas.words import Level, Shows
@@ -123,7 +123,7 @@ class CarGateway:
         url = at_rate(settings.url, self._driver.model.profile.baud)
         self._revocation = RevocationWatch(opened, car_token(settings.fleet, settings.car))
         self._publisher = CarPublisher(opened, settings.fleet, settings.car, self._control, str(url))
-        self._wake = Wake(self._control)
+        self._wake = WriterWakeup(self._control)
         self._commands = CommandHandler(
             settings.fleet,
             settings.car,

@@ -17,7 +17,7 @@ from gateway.control.link_health import LinkHealth
 from gateway.control.reconnect_delay import Attempts
 from gateway.link import Busy, Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.link.baud import BaudWatch
-from gateway.wake import Wake
+from gateway.writer_wakeup import WriterWakeup
 from schemas.links import BAUD, SerialUrl, UsbUrl
 from schemas.words import FrameVerdict, Level, LinkState, Motors
 
@@ -44,7 +44,7 @@ class LinkLoop:
         control: Controller[Driver],
         publisher: CarPublisher,
         commands: CommandHandler,
-        wake: Wake,
+        wake: WriterWakeup,
         *,
         on_gap: Callable[[float], None],
         log_open: Callable[[], None],

@@ -8,7 +8,7 @@ from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import Driver
 from gateway.link import LinkLost
 from gateway.link_loop import LinkLoop
-from gateway.wake import Wake
+from gateway.writer_wakeup import WriterWakeup
 from schemas.process.service_notifier import ServiceNotifier
 from schemas.words import Reason
 
@@ -21,7 +21,7 @@ class Writer:
         driver: Driver,
         link: LinkLoop,
         publisher: CarPublisher,
-        wake: Wake,
+        wake: WriterWakeup,
         *,
         on_gap: Callable[[float], None],
         on_opened_as_changed: Callable[[float], None],

@@ -1,4 +1,4 @@
 """The subcommands of `fleet`: click code and no logic. `fleet.cli` lists them.
 
-They share `options`, `params` and `output`.
+They share `command_group`, `options`, `car_names`, `params` and `output`.
 """

@@ -19,8 +19,9 @@ from fleet.client.commands import (
     servo_request,
     speed_request,
 )
+from fleet.commands.car_names import CarNames, cars_argument
 from fleet.commands.options import carry_out, json_option, take_option, with_client
-from fleet.commands.params import CarNames, Choice, Color, Duration, cars_argument, describe_usage
+from fleet.commands.params import Choice, Color, Duration, describe_usage
 from schemas.commands import COMMANDS, CommandType
 from schemas.suggestion import misspelled
 from schemas.words import FanState, Light, Servo, SpeedStep

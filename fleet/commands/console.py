@@ -19,7 +19,7 @@ import click
 
 from fleet.aio import Fleet
 from fleet.client.client import default_sender
-from fleet.commands.group import (
+from fleet.commands.command_group import (
     DefaultCommandGroup,
     chosen_person,
     connect_option,

@@ -21,6 +21,7 @@ from fleet.client.commands import (
 )
 from fleet.client.lost_hub import LostHub
 from fleet.client.outcome import NO_ANSWER, Outcome, bus_lost_words
+from fleet.commands.car_names import ALL_CARS, any_cars_argument, cars_argument, resolve_cars, stopped_cars_argument
 from fleet.commands.fleets import client_in, stop_in_all_fleets
 from fleet.commands.options import (
     bus_options,
@@ -31,15 +32,7 @@ from fleet.commands.options import (
     take_option,
     with_client,
 )
-from fleet.commands.params import (
-    ALL_CARS,
-    Choice,
-    Duration,
-    any_cars_argument,
-    cars_argument,
-    resolve_cars,
-    stopped_cars_argument,
-)
+from fleet.commands.params import Choice, Duration
 from schemas import keys
 from schemas.bus import BusError, HubUnreachable, NoFleet
 from schemas.process import signals, startup

@@ -8,7 +8,7 @@ from typing import Any, Final
 import click
 from click.shell_completion import CompletionItem
 
-from fleet.commands.group import CommandGroup
+from fleet.commands.command_group import CommandGroup
 from fleet.commands.options import json_option
 from fleet.commands.output import show_table
 from fleet.examples import EXAMPLES

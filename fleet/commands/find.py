@@ -11,10 +11,11 @@ from urllib.parse import quote
 import click
 
 from fleet.client.client import default_sender
-from fleet.commands.group import chosen_person
+from fleet.commands.car_names import car_option
+from fleet.commands.command_group import chosen_person
 from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import MAX_CELL, aligned, echo_csv, echo_safely
-from fleet.commands.params import Duration, car_option, existing_sessions_place
+from fleet.commands.params import Duration, existing_sessions_place
 from fleet.console import DEFAULT_PORT
 from fleet.policy.car_condition import parse_condition
 from fleet.recording import time_spec

@@ -13,8 +13,8 @@ import click
 from fleet.client.client import Fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.client.supervision import ask_cars, fleets_on, gateways_of
-from fleet.commands.group import choose_fleet, chosen_person, is_named, name_fleet_in_hints
-from fleet.commands.params import ALL_CARS
+from fleet.commands.car_names import ALL_CARS
+from fleet.commands.command_group import choose_fleet, chosen_person, is_named, name_fleet_in_hints
 from schemas.bus import Bus
 from schemas.words import Rank
 

@@ -13,7 +13,7 @@ import click
 import segno
 
 from fleet.client.client import Fleet
-from fleet.commands.group import CommandGroup
+from fleet.commands.command_group import CommandGroup
 from fleet.commands.options import cli_errors, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number

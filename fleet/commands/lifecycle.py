@@ -15,8 +15,8 @@ from fleet.client.claims import may_still_move
 from fleet.client.client import certified_sender
 from fleet.client.services import ask_recorder
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
+from fleet.commands.command_group import chosen_person, say
 from fleet.commands.fleets import client_in, the_fleet
-from fleet.commands.group import chosen_person, say
 from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option, not_running
 from fleet.supervisor.child import parse_log_line, runs_directory

@@ -19,14 +19,7 @@ from fleet.client.key_survey import SURVEY_S, SURVEYED_SERVICES, KeyInfo, KeySur
 from fleet.client.reading import Reading, Watch
 from fleet.client.supervision import ask_colors
 from fleet.client.wait import NotInTime
-from fleet.commands.fleets import open_client, open_observer
-from fleet.commands.group import say
-from fleet.commands.options import bus_options, json_option, with_client
-from fleet.commands.output import json_text, reading_line, show_table
-from fleet.commands.params import (
-    Duration,
-    Number,
-    Since,
+from fleet.commands.car_names import (
     any_cars_argument,
     complete_car,
     complete_cars,
@@ -36,6 +29,11 @@ from fleet.commands.params import (
     resolve_cars,
     warn_if_missing,
 )
+from fleet.commands.command_group import say
+from fleet.commands.fleets import open_client, open_observer
+from fleet.commands.options import bus_options, json_option, with_client
+from fleet.commands.output import json_text, reading_line, show_table
+from fleet.commands.params import Duration, Number, Since
 from fleet.commands.ready import READY_WAIT_S, wait_ready
 from fleet.recording.tools import csv_table
 from schemas import keys, topics

@@ -16,9 +16,10 @@ from fleet.client.hints import complete_hints
 from fleet.client.lost_hub import describe_running, explain_no_fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.client.refused_by_hub import why_refused
+from fleet.commands.car_names import complete_people, describe_other_fleets, no_cars, resolve_cars
+from fleet.commands.command_group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
 from fleet.commands.fleets import open_client
-from fleet.commands.group import as_option, choose_fleet, connect_option, fleet_option, hint_options, say
-from fleet.commands.params import Number, complete_people, describe_other_fleets, no_cars, resolve_cars
+from fleet.commands.params import Number
 from schemas import keys
 from schemas.bus import LOOPBACK, BadEndpoint, BusError, NoFleet, resolve_endpoint
 from schemas.words import Reason

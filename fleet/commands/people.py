@@ -3,8 +3,9 @@
 import click
 
 from fleet.client.client import Fleet
+from fleet.commands.car_names import cars_argument, complete_people, resolve_cars
 from fleet.commands.options import end_with, json_option, with_client
-from fleet.commands.params import Duration, cars_argument, complete_people, resolve_cars
+from fleet.commands.params import Duration
 from schemas.commands import COMMANDS, Verb
 
 

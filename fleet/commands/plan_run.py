@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from fleet.client.client import Fleet, default_sender
-from fleet.commands.group import starter_option
+from fleet.commands.command_group import starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.coordinator.coordinator import Coordinator
 from fleet.coordinator.observer import listed_cars

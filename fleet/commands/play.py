@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from fleet.commands.group import connect_option
+from fleet.commands.car_names import car_option
+from fleet.commands.command_group import connect_option
 from fleet.commands.options import cli_errors, from_option, to_option
-from fleet.commands.params import Duration, Number, car_option, session_argument
+from fleet.commands.params import Duration, Number, session_argument
 from fleet.recording import time_spec
 from fleet.recording.left_out import LeftOutCause
 from fleet.recording.selection import Selection

@@ -11,7 +11,7 @@ from fleet.client.car_state import CarState
 from fleet.client.reading import age_of_answer_s
 from fleet.client.supervision import ask_status
 from fleet.commands.options import not_running
-from fleet.supervisor.car_status import describe_start
+from fleet.supervisor.start_report import describe_start
 from schemas import keys
 from schemas.bus import Bus, BusError, messages_of
 from schemas.messages import stamp_ns

@@ -10,8 +10,15 @@ import click
 
 from fleet.client.client import certified_sender, default_sender
 from fleet.client.services import ask_recorder, site_recordings, why_unrecorded
+from fleet.commands.command_group import (
+    DefaultCommandGroup,
+    chosen_person,
+    connect_option,
+    fleet_option,
+    say,
+    starter_option,
+)
 from fleet.commands.fleets import the_fleet
-from fleet.commands.group import DefaultCommandGroup, chosen_person, connect_option, fleet_option, say, starter_option
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.output import echo_safely
 from fleet.commands.params import Choice, Duration

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fleet.commands.car_names import car_option
 from fleet.commands.options import from_option, json_option, to_option
 from fleet.commands.output import echo_safely, with_progress
-from fleet.commands.params import car_option, session_argument
+from fleet.commands.params import session_argument
 from fleet.commands.session_part import part_of
 from schemas import keys
 

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from fleet.commands.car_names import car_option
 from fleet.commands.options import from_option, to_option
 from fleet.commands.output import progress_bar
-from fleet.commands.params import car_option, session_argument
+from fleet.commands.params import session_argument
 from schemas.printable import printable_lines
 from schemas.process import signals, startup
 

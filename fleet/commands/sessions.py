@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from fleet.commands.group import DefaultCommandGroup
+from fleet.commands.car_names import car_option
+from fleet.commands.command_group import DefaultCommandGroup
 from fleet.commands.options import from_option, json_option, to_option
 from fleet.commands.output import aligned, echo_safely, with_progress
-from fleet.commands.params import SessionPath, car_option, session_argument
+from fleet.commands.params import SessionPath, session_argument
 from fleet.commands.redecode import redecode, vector
 from fleet.commands.session_part import part_of
 from fleet.recording import time_spec

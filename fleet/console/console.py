@@ -49,7 +49,7 @@ from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS, Verb
 from schemas.keys import SIMULATOR, person_of, replay_token, topic_key
 from schemas.limits import MAX_REASON_LENGTH
-from schemas.process.suspend import SleepWatch, clock_pair
+from schemas.process.computer_sleep import SleepWatch, clock_pair
 from schemas.rights import People
 from schemas.topics import TOPICS
 from schemas.words import MODE_TEXTS, Phase, Rank, Reason, Scope

@@ -31,7 +31,7 @@ from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to
 from schemas import keys, messages
 from schemas.bus import HubKeeper
 from schemas.gen import fleet_v1_pb2 as pb
-from schemas.process.suspend import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
+from schemas.process.computer_sleep import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.rights import People
 from schemas.words import Level, Phase
 

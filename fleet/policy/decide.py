@@ -49,6 +49,7 @@ from fleet.policy.explain import (
     is_new,
     is_reworded,
 )
+from fleet.policy.phases import follow_phase
 from fleet.policy.plan.plan import Effect, Plan, Rule
 from fleet.policy.role_allocation import (
     ROLE_KEPT_S,
@@ -60,7 +61,7 @@ from fleet.policy.role_allocation import (
     follow_needs,
     reserved_roles,
 )
-from fleet.policy.rules import CarSets, RuleState, follow_phase, follow_rules, targets
+from fleet.policy.rules import CarSets, RuleState, follow_rules, targets
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import (
     HUB_RETURN_GRACE_S,

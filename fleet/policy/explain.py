@@ -12,9 +12,10 @@ from msgspec.structs import replace
 from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decision import LEFT_ALONE, Decision, DecisionKind
 from fleet.policy.lint.reachability import describe_unmeasured
+from fleet.policy.phases import PhaseState
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Quantifier, Role, Rule
 from fleet.policy.role_allocation import Barrier, Candidates, RoleAllocation
-from fleet.policy.rules import PhaseState, RuleState
+from fleet.policy.rules import RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HeldRole
 from schemas.keys import name_of

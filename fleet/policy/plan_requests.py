@@ -6,8 +6,8 @@ from typing import Final
 from msgspec.structs import replace
 
 from fleet.policy.denial_words import fleet_refusal
+from fleet.policy.phases import PhaseState
 from fleet.policy.plan.plan import Plan
-from fleet.policy.rules import PhaseState
 from fleet.policy.state import PolicyState
 from schemas import keys
 from schemas.rights import People

@@ -1,4 +1,4 @@
-"""Follows rules and phases: the rules in force, the car that triggered each, and the phase. Pure; times in s."""
+"""Follows the rules of a plan: which are in force, and the car that triggered each. Pure; times in s."""
 
 from collections.abc import Collection, Iterator, Mapping
 from types import MappingProxyType
@@ -7,7 +7,7 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from fleet.policy.debounce import HYSTERESIS_S, Debounced, debounce
+from fleet.policy.debounce import Debounced, debounce
 from fleet.policy.plan.plan import (
     ALL_CARS,
     OTHER_CARS,
@@ -15,18 +15,14 @@ from fleet.policy.plan.plan import (
     Effect,
     Plan,
     PlanCondition,
-    PlanPhase,
     Quantifier,
     Rule,
 )
 from fleet.policy.snapshot import FleetSnapshot
 
-PHASE_SETTLE_TIMEOUT_S: Final = 15.0
-"""Maximum time to wait for a phase's cars before its timeout starts. The recovery of a car and the opening of a mode
-take 4.9 + 3.5 s (docs/reference/protocol.md#stops)."""
 _ALL_CARS: Final = ""
 """Used in place of a car's name if the condition is about all cars."""
-_NO_CARS: Final[Mapping[str, Debounced]] = MappingProxyType({})
+NO_CARS: Final[Mapping[str, Debounced]] = MappingProxyType({})
 
 
 class RuleState(Struct, frozen=True):
@@ -41,21 +37,6 @@ class RuleState(Struct, frozen=True):
     since: float = 0.0
     used: tuple[str, ...] = ()
     """The readings that triggered the rule, with their values at that time."""
-
-
-class PhaseState(Struct, frozen=True):
-    """The current phase. The name is empty if the plan has no phases."""
-
-    name: str = ""
-    since: float = 0.0
-    until: Mapping[str, Debounced] = field(default_factory=dict)
-    why: str = ""
-    """The reason why the phase began."""
-    used: tuple[str, ...] = ()
-    settled: bool = False
-    """True once the phase's cars were in their modes, or PHASE_SETTLE_TIMEOUT_S has passed."""
-    waited_s: float = 0.0
-    """Time until the cars settled. The phase's timeout starts then."""
 
 
 class CarSets(Struct, frozen=True):
@@ -91,9 +72,9 @@ def _follow_rule(rule: Rule, snapshot: FleetSnapshot, cars: CarSets, before: Rul
     condition is true, as long as the car that triggered the rule is present. If that car is gone, another car for which
     the rule's condition is true takes its place. If there is none, the rule ends.
     """
-    when = _debounce_by_car(rule.when, snapshot, cars, before.when, now)
+    when = debounce_by_car(rule.when, snapshot, cars, before.when, now)
     true_for = [car for car, debounced in when.items() if debounced.on]
-    until = _NO_CARS if rule.until is None else _debounce_by_car(rule.until, snapshot, cars, before.until, now)
+    until = NO_CARS if rule.until is None else debounce_by_car(rule.until, snapshot, cars, before.until, now)
     ended = any(debounced.on for debounced in until.values())
     trigger = (
         before.trigger
@@ -110,11 +91,11 @@ def _follow_rule(rule: Rule, snapshot: FleetSnapshot, cars: CarSets, before: Rul
         trigger = min(true_for, key=lambda car: (car not in cars.free, when[car].since, car), default=None)
     if before.on and trigger == before.trigger:
         return replace(before, when=when, until=until)
-    used = _readings_used(rule.when, snapshot, cars, trigger, now)
+    used = readings_used(rule.when, snapshot, cars, trigger, now)
     return RuleState(on=True, when=when, until=until, trigger=trigger, since=now, used=used)
 
 
-def _debounce_by_car(
+def debounce_by_car(
     condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, before: Mapping[str, Debounced], now: float
 ) -> Mapping[str, Debounced]:
     """Return the debounced condition for each car, or under the name _ALL_CARS if it is about all cars."""
@@ -123,7 +104,7 @@ def _debounce_by_car(
             [snapshot.holds(condition.expression, car, now) for car in _watched_cars(condition, cars, before)]
         )
         debounced = debounce(before.get(_ALL_CARS), value, condition.for_s, now)
-        return _NO_CARS if debounced is None else {_ALL_CARS: debounced}
+        return NO_CARS if debounced is None else {_ALL_CARS: debounced}
     result = {}
     for car in _watched_cars(condition, cars, before):
         debounced = debounce(before.get(car), snapshot.holds(condition.expression, car, now), condition.for_s, now)
@@ -156,10 +137,11 @@ def _all_of(each: list[bool | None]) -> bool | None:
     return False if False in each else None if None in each else True
 
 
-def _readings_used(
+def readings_used(
     condition: PlanCondition, snapshot: FleetSnapshot, cars: CarSets, trigger: str | None, now: float
 ) -> tuple[str, ...]:
-    read = [trigger] if trigger is not None else _watched_cars(condition, cars, _NO_CARS)
+    """Return the readings that made a condition true, with their values: of the car that triggered it, or of all."""
+    read = [trigger] if trigger is not None else _watched_cars(condition, cars, NO_CARS)
     return tuple(reading for car in read for reading in snapshot.describe_readings(condition.expression, car, now))
 
 
@@ -179,51 +161,3 @@ def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: 
             yield who
         case who:
             yield from (car for car in subjects if roles.get(car) == who)
-
-
-def follow_phase(
-    plan: Plan,
-    snapshot: FleetSnapshot,
-    cars: CarSets,
-    before: PhaseState,
-    rules: Mapping[int, RuleState],
-    now: float,
-    *,
-    ready: bool,
-) -> PhaseState:
-    """Return the phase now. Each phase lasts at least HYSTERESIS_S, so that two phases do not alternate quickly.
-
-    `ready` is True if every car is known and in its mode. The phase's timeout starts then, or after
-    PHASE_SETTLE_TIMEOUT_S.
-    """
-    phase = plan.phases.get(before.name)
-    if phase is None:
-        return PhaseState(plan.first_phase, now, why="the plan begins with it" if plan.first_phase else "")
-    lasted_s = now - before.since
-    for index, state in rules.items():
-        rule = plan.rules[index]
-        for effect in rule.effects:
-            # A rule that was already in force when this phase began does not start another phase.
-            if effect.phase not in (None, phase.name) and state.on and state.since >= before.since:
-                if lasted_s < HYSTERESIS_S:
-                    continue
-                assert effect.phase is not None
-                return PhaseState(effect.phase, now, why=f"{rule.name}: {rule.when.text}", used=state.used)
-    if not before.settled and lasted_s > 0:
-        settled = ready or lasted_s >= PHASE_SETTLE_TIMEOUT_S
-        before = replace(before, settled=settled, waited_s=before.waited_s if settled else lasted_s)
-    return _follow_phase_end(phase, snapshot, cars, before, lasted_s, now)
-
-
-def _follow_phase_end(
-    phase: PlanPhase, snapshot: FleetSnapshot, cars: CarSets, before: PhaseState, lasted_s: float, now: float
-) -> PhaseState:
-    until = _NO_CARS if phase.until is None else _debounce_by_car(phase.until, snapshot, cars, before.until, now)
-    true_for = [car for car, debounced in until.items() if debounced.on]
-    if phase.until is not None and phase.next is not None and true_for and lasted_s >= HYSTERESIS_S:
-        used = _readings_used(phase.until, snapshot, cars, true_for[0] or None, now)
-        return PhaseState(phase.next, now, why=f"{phase.name} ends with {phase.until.text}", used=used)
-    settled_s = lasted_s - before.waited_s
-    if phase.timeout_s is not None and phase.on_timeout is not None and settled_s >= max(phase.timeout_s, HYSTERESIS_S):
-        return PhaseState(phase.on_timeout, now, why=f"{phase.name} lasts at most {phase.timeout_s:g} s")
-    return replace(before, until=until)

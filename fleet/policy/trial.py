@@ -6,8 +6,8 @@ from msgspec import Struct
 
 from fleet.policy.decide import FIRST_STATE_TIMEOUT_S, step
 from fleet.policy.decision import Decision, DecisionKind
+from fleet.policy.phases import PhaseState
 from fleet.policy.plan.plan import Plan
-from fleet.policy.rules import PhaseState
 from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
 from fleet.policy.state import HeldRole, PolicyState, carry_over
 

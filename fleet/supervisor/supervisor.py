@@ -23,7 +23,7 @@ from fleet.client.services import why_unrecorded
 from fleet.fleetfile.fleet_file import people_table
 from fleet.policy.denial_words import fleet_refusal
 from fleet.supervisor import spec
-from fleet.supervisor.car_status import CarStatus, StartProgress, describe_old_stops, describe_start
+from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.child import Log, new_run, remove_links, write_copy
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
@@ -39,6 +39,7 @@ from fleet.supervisor.spec import (
     CarProcessSpec,
     FleetSpec,
 )
+from fleet.supervisor.start_report import StartProgress, describe_old_stops, describe_start
 from fleet.supervisor.supervisor_service import CommandRefused, RestartNeeded, SupervisorService
 from schemas.bus import Bus, BusError, accepts, resolve_endpoint
 from schemas.gen import fleet_v1_pb2 as pb

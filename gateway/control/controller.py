@@ -36,7 +36,7 @@ from gateway.control.driver import LATE_DRIVE_S, Desk, Driver
 from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
 from gateway.control.sender_presence import Senders
 from schemas.keys import name_of
-from schemas.limits import MAX_QUEUE_TIME_S, STREAM_SILENCE_S
+from schemas.limits import MAX_QUEUE_TIME_S
 from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
 from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
@@ -173,17 +173,9 @@ class Controller(Generic[D_co]):
         # Track the drives of a stream even if they are refused. Otherwise a stream that goes on after a stop would
         # drive the car as soon as somebody else's lease ends.
         halted = isinstance(what, Drive) and not self._may_drive(command, what, now)
-        refusal = refusals.refuse(command, self._context(now, self.driver.refusal(what)))
-        if refusal is not None:
+        refusal = refusals.refuse(command, self._context(now, self.driver.refusal(what), is_halted=halted))
+        if refusal is not None:  # a refused command changes neither the lease nor the hold
             return self._reject(pending, *refusal, now)
-        if halted:
-            words = f"{self.car} was just stopped. Send no drive command for {STREAM_SILENCE_S:g} s, then drive again."
-            return self._reject(pending, Reason.HELD, words, now)
-        if lapsed := self._lapsed(command):
-            return self._reject(pending, Reason.LAPSED, lapsed, now)
-        busy = self._too_busy(command, now)
-        if busy:  # check this before the lease and the hold are changed: a refused command changes neither
-            return self._reject(pending, Reason.EXPIRED, busy, now)
         if isinstance(what, Pause):
             return self._stop(pending, now)
         self._log.accept(command)
@@ -452,32 +444,6 @@ class Controller(Generic[D_co]):
         """Return how many seconds a motion would have to wait for the car, as far as that is known."""
         return max(self.driver.free_at(now) - now, 0.0)
 
-    def _too_busy(self, command: Command, now: float) -> str:
-        """Return why a sample of a stream would expire before its frame could be written. Empty if it would not.
-
-        A drive outside a stream waits instead, and its duration begins when its frame is written.
-        """
-        what = command.what
-        if not command.streamed or not isinstance(what, Drive) or what.motion is Motion.STOP:
-            return ""
-        busy_s = self._busy_s(now)
-        if what.duration_s > busy_s:
-            return ""
-        return f"{self.car} is busy for another {busy_s:.1f} s. After that, the next samples of this stream drive it."
-
-    def _lapsed(self, command: Command) -> str:
-        """Return an error if this command only continues a drive, and that drive is over. Else return an empty text.
-
-        Suppose the hub stood still while somebody held a key, and the car has stopped. When the hub continues, it
-        delivers the newest samples of that press, which must not start the car again.
-        """
-        what, held = command.what, self._queue.held
-        if not isinstance(what, Drive) or not what.continues or what.motion is Motion.STOP:
-            return ""
-        if held is not None and held.motion is what.motion and held.sender == command.sender:
-            return ""
-        return f"{self.car} has stopped, because no drive arrived for too long. Press again."
-
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
         sender, held = pending.command.sender, self._queue.held
         if held is not None and held.motion is drive.motion and held.sender == sender:
@@ -602,7 +568,10 @@ class Controller(Generic[D_co]):
             self.people, safety.estops, safety.pauses, safety.hold, safety.loan_at(now), safety.lease_at(now)
         )
 
-    def _context(self, now: float, unsupported: str | None = None) -> refusals.CommandContext:
+    def _context(
+        self, now: float, unsupported: str | None = None, *, is_halted: bool = False
+    ) -> refusals.CommandContext:
+        held = self._queue.held
         return refusals.CommandContext(
             car=self.car,
             now=now,
@@ -617,4 +586,7 @@ class Controller(Generic[D_co]):
             queued=len(self._queue.one_shots),
             loan_until=self.safety.loan_until,
             slept_at=self._slept_at,
+            is_halted=is_halted,
+            held=None if held is None else (held.motion, held.sender),
+            busy_s=self._busy_s(now),
         )

@@ -1,6 +1,7 @@
 """Decides whether a command may be carried out now: a table of what each command needs, and a rule for each need.
 
-Pure: it gets the context of the car and returns a refusal or None. A stop or e-stop is never refused.
+Pure: it gets the context of the car and returns a refusal or None. A stop or e-stop is never refused. Only two refusals
+are elsewhere: the parser's, of a command that it cannot read, and the controller's, of one that came before.
 """
 
 from typing import Final
@@ -24,6 +25,7 @@ from gateway.control.commands import (
     Unpause,
 )
 from schemas.keys import name_of
+from schemas.limits import STREAM_SILENCE_S
 from schemas.rights import Authority, Bar, Denial, Estop, FleetPause, LeaseState, Loan, Right, Sender
 from schemas.suggestion import did_you_mean
 from schemas.words import Mode, Motion, Rank, Reason
@@ -60,6 +62,12 @@ class CommandContext(Struct, frozen=True):
     """When the loan ends, s, monotonic."""
     slept_at: float = float("-inf")
     """When the last sleep of the computer was noticed."""
+    is_halted: bool = False
+    """True if the sender's drives are refused until it pauses, because the car was stopped."""
+    held: tuple[Motion, Sender] | None = None
+    """The motion that the car holds, and who holds it."""
+    busy_s: float = 0.0
+    """How long a motion would have to wait for the car, as far as that is known."""
 
 
 class Needs(Struct, frozen=True):
@@ -133,8 +141,11 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
         return Reason.UNSUPPORTED, context.unsupported
     if isinstance(what, Resume):
         return _resume(what, sender, context)
-    refusal = _unmet(command, needs(what), context)
-    return _unknown_borrower(what.to, context) if refusal is None and isinstance(what, Lend) else refusal
+    if (refusal := _unmet(command, needs(what), context)) is not None:
+        return refusal
+    if isinstance(what, Lend):
+        return _unknown_borrower(what.to, context)
+    return _drive(command, what, context) if isinstance(what, Drive) else None
 
 
 def _out_of_time(command: Command, context: CommandContext) -> str | None:
@@ -154,6 +165,25 @@ def _out_of_time(command: Command, context: CommandContext) -> str | None:
         return None
     words = f"the command arrived {age_s:.1f} s late (maximum {command.ttl_s:g} s). Send it again."
     return words if age_s < CLOCK_DOUBT_S else f"{words} If that does not help: {clocks.lower()[0]}{clocks[1:]}"
+
+
+def _drive(command: Command, drive: Drive, context: CommandContext) -> Refusal | None:
+    """Return why this drive does not begin or continue. None if it does."""
+    car = context.car
+    if context.is_halted:
+        words = f"{car} was just stopped. Send no drive command for {STREAM_SILENCE_S:g} s, then drive again."
+        return Reason.HELD, words
+    if drive.motion is Motion.STOP:
+        return None
+    # Suppose the hub stood still while somebody held a key, and the car has stopped. When the hub continues, it
+    # delivers the newest samples of that press, which must not start the car again.
+    if drive.continues and context.held != (drive.motion, command.sender):
+        return Reason.LAPSED, f"{car} has stopped, because no drive arrived for too long. Press again."
+    # A drive outside a stream waits instead, and its duration begins when its frame is written.
+    if command.streamed and drive.duration_s <= context.busy_s:
+        busy = f"{car} is busy for another {context.busy_s:.1f} s"
+        return Reason.EXPIRED, f"{busy}. After that, the next samples of this stream drive it."
+    return None
 
 
 def _unknown_borrower(person: str, context: CommandContext) -> Refusal | None:

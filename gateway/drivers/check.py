@@ -169,8 +169,8 @@ class Bench:
             said += driver.flush(self.now)
             for event in said:
                 driver.on_event(event, self.now)
-            # As in `gateway.wake`: events and ticks wake the writer only if there are records, or if its next frame is
-            # now due earlier than planned.
+            # As in `gateway.writer_wakeup`: events and ticks wake the writer only if there are records, or if its next
+            # frame is now due earlier than planned.
             is_early = (said or ticked) and (self.control.has_records or driver.next_at(self.now) < self._due_at)
             if is_early or self.now >= self._due_at:
                 self.write()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from schemas import bus
-from schemas.process.suspend import SleepWatch
+from schemas.process.computer_sleep import SleepWatch
 from tests.support.gateway_here import served
 from tests.support.judge import Judge
 from tests.support.ports import free_endpoint

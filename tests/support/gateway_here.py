@@ -9,7 +9,7 @@ from gateway.bus.car_service import CarService
 from gateway.car import CarGateway, Settings
 from gateway.link import parse_url
 from schemas import bus
-from schemas.process.suspend import SleepWatch
+from schemas.process.computer_sleep import SleepWatch
 from tests.support.processes import FleetProcesses
 
 

@@ -50,7 +50,7 @@ from gateway.drivers.lines import LineSplitter
 from gateway.drivers.plain import UNASKED_LOG_S, PlainDriver
 from gateway.drivers.plain_profile import PlainProfile
 from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis
-from gateway.drivers.waveshare.feedback import Feedback, read_line
+from gateway.drivers.waveshare.feedback_parser import Feedback, read_line
 from gateway.drivers.waveshare.firmware import UgvFirmware
 from schemas.words import FrameOrigin, Level, Light, Motion, Motors, Phase, Reason, Shows
 

@@ -12,8 +12,8 @@ from click.testing import CliRunner, Result
 
 from fleet.cli import cli
 from fleet.client.client import Fleet
+from fleet.commands.car_names import complete_cars, resolve_cars
 from fleet.commands.fleet_file import prompt_name
-from fleet.commands.params import complete_cars, resolve_cars
 from fleet.recording.reading.session import NoSession, Session
 from schemas import keys
 from schemas.bus import reply_message, router_config

@@ -8,13 +8,8 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from fleet.commands.params import (
-    Color,
-    Duration,
-    Number,
-    cars_argument,
-    session_argument,
-)
+from fleet.commands.car_names import cars_argument
+from fleet.commands.params import Color, Duration, Number, session_argument
 from fleet.recording.session_lookup import newest_first
 from schemas.duration import format_duration, parse_duration
 

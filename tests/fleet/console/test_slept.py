@@ -8,7 +8,7 @@ from typing import Any
 
 from fleet.aio import Fleet
 from fleet.console.console import Console
-from schemas.process.suspend import SleepWatch
+from schemas.process.computer_sleep import SleepWatch
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 

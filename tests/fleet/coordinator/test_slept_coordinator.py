@@ -8,7 +8,7 @@ from fleet.coordinator import coordinator
 from fleet.coordinator.coordinator import Coordinator
 from fleet.coordinator.observer import FleetObserver
 from fleet.policy.plan.plan_parser import parse
-from schemas.process.suspend import SleepWatch
+from schemas.process.computer_sleep import SleepWatch
 from tests.fleet.coordinator.test_observer import come, said
 
 

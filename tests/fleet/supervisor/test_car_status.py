@@ -8,16 +8,16 @@ import pytest
 from google.protobuf.timestamp_pb2 import Timestamp
 from rich.console import Console
 
-from fleet.supervisor.car_status import (
+from fleet.supervisor.car_status import CarStatus
+from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
+from fleet.supervisor.spec import FleetSpec
+from fleet.supervisor.start_report import (
     LINK_OPEN_TIMEOUT_S,
     READY_TIMEOUT_S,
-    CarStatus,
     StartProgress,
     describe_old_stops,
     describe_start,
 )
-from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
-from fleet.supervisor.spec import FleetSpec
 from fleet.supervisor.status_table import Table
 from fleet.supervisor.supervisor import Supervisor
 from schemas.bus import DEFAULT_ENDPOINT

@@ -1,5 +1,7 @@
 """Detects from the car's readings whether a stop arrived. `cases` lists the possible evidence of each stop. Pure.
 
+car_monitor.py and stop_executor.py act on what is found here: the first reports it, the second stops the car again.
+
 The car acknowledges nothing. A gateway only knows the frames that it wrote, and the times at which readings arrived.
 This essay is about what those times can prove, what they cannot, and what is still doubtful. Two frames stop a car. The
 general stop ends a motion of mode 0, and other modes ignore it. `MODE00` brakes and closes any mode.

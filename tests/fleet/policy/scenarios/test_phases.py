@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from fleet.coordinator.plan_state_file import CoordinatorStateFile
+from fleet.policy.phases import PHASE_SETTLE_TIMEOUT_S
 from fleet.policy.plan.plan_parser import parse
 from fleet.policy.plan_requests import PlanRequest, on_request
-from fleet.policy.rules import PHASE_SETTLE_TIMEOUT_S
 from fleet.policy.snapshot import FleetSnapshot
 from fleet.policy.state import PersistedPolicy, restore, to_persisted
 from tests.fleet.policy.cars import GONE, HERE, PolicyRun

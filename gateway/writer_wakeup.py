@@ -11,7 +11,7 @@ MAX_SLEEP_S: Final = 3600.0
 """Maximum sleep of the writer, because asyncio accepts no infinite timer."""
 
 
-class Wake:
+class WriterWakeup:
     """Wakes the writer. Create it in the writer's loop."""
 
     def __init__(self, control: Controller[Driver]) -> None:

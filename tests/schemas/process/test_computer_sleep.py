@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from schemas.process.suspend import MAX_READS, MIN_SLEEP_S, SleepWatch, clock_pair
+from schemas.process.computer_sleep import MAX_READS, MIN_SLEEP_S, SleepWatch, clock_pair
 from tests.support.processes import freeze
 
 
@@ -91,7 +91,7 @@ def test_process_that_is_stopped_has_not_slept() -> None:
     """The clocks of the system are the point here, so it is a real process."""
     program = """
         import sys
-        from schemas.process.suspend import SleepWatch, clock_pair
+        from schemas.process.computer_sleep import SleepWatch, clock_pair
         watch, told = SleepWatch(clock_pair()), 0.0
         print("ready", flush=True)
         while not sys.stdin.readline():

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.control.driver import Rejected, TextLine
-from gateway.drivers.waveshare.feedback import Feedback, read_line
+from gateway.drivers.waveshare.feedback_parser import Feedback, read_line
 from gateway.drivers.waveshare.firmware import UgvFirmware
 from schemas.words import Cause
 
