@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
+from math import inf
 from typing import Any, Final, Self
 
 from fleet.client import history_query
@@ -59,8 +60,6 @@ from schemas.topics import Qos
 from schemas.words import Phase, Rank, RunState, Scope
 
 _EVENT: Final = topics.TOPICS["event/command"].message
-_NO_TIMEOUT_POLL_S: Final = 3600.0
-"""Poll interval of a wait without a timeout."""
 _MAX_STOP_THREADS: Final = 1024
 """Maximum number of threads for the queries of stops. Each query waits on its own thread. A stop of all cars makes two
 queries: to the gateways and to the supervisor."""
@@ -72,7 +71,9 @@ command_log = logging.getLogger(json_log.COMMANDS)
 
 
 def default_sender(person: str | None = None) -> str:
-    """Return the default name of a sender: person@host-pid. The person is FLEET_AS, else the user's login.
+    """Return the default name of a sender: person@host-pid.
+
+    The person is `person`, else FLEET_AS, else the user's login.
 
     Raises keys.BadKey for a bad name of a person.
     """
@@ -110,8 +111,8 @@ class Fleet:
     (default: FLEET_AS, else the user's login). `sender` is the full name of the sender, `person@host-pid` by default.
     `kind` is the rank of the sender: `script`, `person` (outranks scripts) or `coordinator`. `start_hub`: start a hub
     on this computer if none runs. `identity` is the owner of the certificate to use, such as `service.coordinator`
-    (default: the user). On a hub with certificates, the person is the owner of the certificate, and another `person` or
-    `sender` raises keys.BadKey.
+    (default: the user). If a person owns the certificate, commands are sent in this person's name, and another `person`
+    or `sender` raises keys.BadKey.
 
     While a Fleet is open, it has the liveliness token `<fleet>/@operator/<sender>` on the bus. If the token disappears,
     for example because the program has crashed, gateways end the drives of this client, and stop these cars. Modes that
@@ -268,20 +269,22 @@ class Fleet:
         """Wait until the condition `when` is true for a reading, and return it. The current reading counts, too.
 
         With `for_s`, the condition must have been true in all readings of this time, by their stamps. Without
-        `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError) and conditions.BadExpression.
+        `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError), conditions.BadExpression, and BusError if
+        this Fleet is closed meanwhile.
         """
         key_expression = self.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)
         began = time.monotonic()
 
         def left_s() -> float:
-            return _NO_TIMEOUT_POLL_S if timeout_s is None else began + timeout_s - time.monotonic()
+            return inf if timeout_s is None else began + timeout_s - time.monotonic()
 
         with self.watch(expression) as stream:  # before the query, so that no value in between is missed
             for reading in self._read(key_expression, max(_MIN_QUERY_TIMEOUT_S, min(ANSWER_TIMEOUT_S, left_s()))):
                 if waiting.ends(reading, datetime.now(UTC)):
                     return reading
             while (left := left_s()) > 0:
+                self._check_open()
                 coming = stream.within(left)
                 if coming is not None and waiting.ends(coming, datetime.now(UTC), time.monotonic()):
                     return coming
@@ -361,7 +364,7 @@ class Fleet:
     def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Send a command to the cars, or to all with one wildcard query if `cars` is None. Return their outcomes.
 
-        A missing or silent car has its own outcome and does not delay the others.
+        All cars get the command at once. The list is complete when the last outcome is known, or is given up.
         """
         return self.outcomes(self.send(request, cars))
 
@@ -428,6 +431,7 @@ class Fleet:
     def _query(self, target: str, command: PendingCommand, payload: bytes) -> None:
         """Send the command to one car, or to all, and queue the answers. Runs on a thread of the pool."""
         verb = command.request.verb
+        # The text is used only for cars that have not answered. For all cars, each one's name replaces the `*`.
         why_silent = f"{target} may or may not carry it out: its gateway ended without an answer. Look at the car."
         try:
             answers = self.bus.query(
@@ -493,9 +497,10 @@ class Car(CarCommands[Outcome]):
     def lease(self, *, take: bool = False) -> "Lease[LeasedCar]":
         """Reserve the car for a block: `with fleet.car("red").lease() as car: car.drive("forward", 1.5)`.
 
-        Within the block, nobody of the same rank can drive the car. At its end, the car is stopped and released. In the
-        block, a command that is not carried out raises NotCarriedOut. Once another sender has taken or stopped the car,
-        every command raises LeaseLost. Either can also be raised when the block begins.
+        Within the block, nobody of the same or a lower rank can drive the car, unless a person takes it over. At its
+        end, the car is stopped and released. In the block, a command that is not carried out raises NotCarriedOut. Once
+        another sender has taken or stopped the car, every command raises LeaseLost. Either can also be raised when the
+        block begins.
         With `take`, a person (`Fleet(kind="person")`) takes the car over from another person.
         """
         return Lease(self._fleet, self.name, partial(LeasedCar, self._fleet, self.name), take=take)

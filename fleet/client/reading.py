@@ -159,19 +159,20 @@ class Watch:
         return self
 
     def __next__(self) -> Reading:
-        while not self._closed.is_set():
-            reading = self.within(_CLOSE_POLL_S)
-            if reading is not None:
-                return reading
-        raise StopIteration
+        if (reading := self.within(inf)) is None:
+            raise StopIteration
+        return reading
 
     def within(self, seconds: float) -> Reading | None:
-        """Return the next reading, or None if none arrives within this time."""
+        """Return the next reading, or None if none arrives within this time, or if the stream is closed."""
         deadline = time.monotonic() + seconds
         while not self._closed.is_set():
+            left_s = deadline - time.monotonic()
             try:
-                reading = reading_of(self._queue.get(timeout=max(0.0, deadline - time.monotonic())))
+                reading = reading_of(self._queue.get(timeout=max(0.0, min(left_s, _CLOSE_POLL_S))))
             except queue.Empty:
+                if left_s > _CLOSE_POLL_S:
+                    continue
                 return None
             except (messages.BadPayload, KeyError):
                 self.unreadable += 1

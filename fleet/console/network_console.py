@@ -27,6 +27,7 @@ from fleet.console.pairing import (
     PagePerson,
     PairedDevice,
     PeopleBook,
+    TooManyGuesses,
     code_words,
     new_code,
 )
@@ -178,15 +179,15 @@ class Lan:
     async def pair(
         self, code: str, client: tuple[str, int], device: str, cookie_before: str = ""
     ) -> tuple[str | None, float, PagePerson | None]:
-        """Pair a device. Return its cookie, or None and the time to wait before the next try (s). Raises ClassFull.
+        """Pair a device. Return its cookie, or None and the time to wait before the next try (s).
 
         cookie_before: the cookie that the device has already, if any. If the code is that of a class, a paired device
-        keeps its person.
+        keeps its person. Raises ClassFull, and TooManyGuesses while the address has to wait.
         """
         now, address = time.monotonic(), client[0]
         if (wait_s := self.guesses.wait_s(address, now)) > 0:
             self.guesses.wrong += 1
-            return None, wait_s, None
+            raise TooManyGuesses(wait_s)
         book = self.people.read()
         known, state = book.device_of(cookie_before, time.time())
         if known is not None and state == "valid" and book.is_class_code(code, time.time()):

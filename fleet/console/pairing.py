@@ -62,6 +62,14 @@ class ClassFull(Exception):
     """There is no place for another guest. The message says what to do."""
 
 
+class TooManyGuesses(Exception):
+    """Too many wrong codes came from an address, so it has to wait. `wait_s`: how long, s."""
+
+    def __init__(self, wait_s: float) -> None:
+        super().__init__(f"wait {wait_s:.0f} s")
+        self.wait_s = wait_s
+
+
 class NoGuest(ValueError):
     """There is no guest with this id. The message says so."""
 

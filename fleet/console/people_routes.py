@@ -9,7 +9,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from fleet.console.page_requests import BadPageMessage, PageMessage
-from fleet.console.pairing import ClassFull, PagePerson
+from fleet.console.pairing import ClassFull, PagePerson, TooManyGuesses
 from fleet.console.request_body import read_text
 from fleet.console.request_filter import PAIR_PATH, PERSON, Scope
 from schemas.words import Rank
@@ -38,6 +38,10 @@ def pair_routes(lan: "Lan") -> list[Route]:
             cookie, wait_s, person = await lan.pair(code, (request.client.host, request.client.port), device, before)
         except ClassFull as error:
             return _failure(str(error), 409)
+        except TooManyGuesses as error:  # the code was not looked at, so it may be right
+            wait = str(math.ceil(error.wait_s))
+            words = f"Too many wrong codes came from this device's address. Try again in {wait} s."
+            return _failure(words, 429, {"retry-after": wait})
         if cookie is None or person is None:
             words = "This code is wrong, used or too old."
             if wait_s == 0:
@@ -50,7 +54,10 @@ def pair_routes(lan: "Lan") -> list[Route]:
 
 
 def people_routes(lan: "Lan | None") -> list[Route]:
-    """Return the routes for those who may pair and revoke devices: pages on this computer, and leads."""
+    """Return the routes that list and change paired devices, for pages on this computer and for leads.
+
+    Other pages learn that they may not.
+    """
 
     async def people(request: Request) -> Response:
         may_pair = _may_pair(request.scope)
@@ -75,8 +82,10 @@ def people_routes(lan: "Lan | None") -> list[Route]:
             if message.kind == "assign":
                 await lan.assign(message.text("id"), PagePerson(message.text("name")))
                 return JSONResponse({"ok": True})
-            person = PagePerson(message.text("name"), message.text("rank"))
-            return JSONResponse({"ok": True, **await lan.offer(person)})
+            if message.kind == "pair":
+                person = PagePerson(message.text("name"), message.text("rank"))
+                return JSONResponse({"ok": True, **await lan.offer(person)})
+            return _failure(f'There is no request "{message.kind}".', 400)
         except (BadPageMessage, ValueError) as error:
             return _failure(str(error), 400)
         except OSError as error:
@@ -86,7 +95,8 @@ def people_routes(lan: "Lan | None") -> list[Route]:
 
 
 def _may_pair(scope: Scope) -> bool:
-    return PERSON not in scope or scope[PERSON].rank == Rank.LEAD
+    is_here = PERSON not in scope  # a page on this computer needs no pairing
+    return is_here or scope[PERSON].rank == Rank.LEAD
 
 
 def _failure(words: str, status: int, headers: dict[str, Any] | None = None) -> Response:

@@ -34,8 +34,8 @@ class CoordinatorStateFile:
     def load(self) -> PersistedPolicy:
         """Return the persisted state, or an empty one if the file cannot be read or belongs to another bus.
 
-        Phase and rules are restored only within one `fleet up` run. In a new run, the plan starts again with the same
-        roles.
+        Phase and rules are restored only in a run of the same name, and coordinators that were started by hand all have
+        the empty name. In another run, the plan starts again with the same roles.
         """
         if self.path is None:
             return PersistedPolicy()
@@ -64,10 +64,10 @@ class CoordinatorStateFile:
             return False
         if _same(state, self._last):
             return True
-        self._last = state
         content = {"endpoint": self._endpoint, "run": self._run, **to_builtins(state)}
         with contextlib.suppress(OSError):
             write_state(self.path, json.dumps(content))
+            self._last = state
             return True
         return False
 

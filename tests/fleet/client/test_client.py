@@ -414,6 +414,24 @@ def test_closing_ends_what_is_waited_for(cars: Cars, gateway: Bus) -> None:
     assert len(outcomes) == 1
 
 
+def test_closing_ends_a_wait_without_timeout(cars: Cars) -> None:
+    client = Fleet(cars.endpoint, sender="ann")
+    errors: list[BusError] = []
+
+    def wait() -> None:
+        try:
+            client.wait("red/sensor/range", "range_m > 4.4")
+        except BusError as error:
+            errors.append(error)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    wait_for(lambda: client._watches, "it watches")
+    client.close()
+    waiting.join(20)
+    assert len(errors) == 1
+
+
 def test_closed_fleet_raises_bus_error(cars: Cars) -> None:
     with Fleet(cars.endpoint, sender="ann") as client:
         red = client.car("red")

@@ -520,7 +520,9 @@ def test_guesses_get_nothing_and_are_slowed_down(stage: ServerStage) -> None:
     assert len(statuses) > 40
     assert set(statuses) <= {403, 429}
     assert statuses.count(403) < 10, "the others were not even compared"
-    assert stranger.pair(code)["ok"] is False, "the right code must wait, too"
+    late = stranger.pair(code)
+    assert late["ok"] is False, "the right code must wait, too"
+    assert "wrong codes" in late["words"], "and is not called wrong"
     assert json.loads(answer(stage.console.port, "GET", "/people")[1])["lan"]["wrong_codes"] > 40
     assert stage.log().count("wrong pairing code") < 20
     assert NetworkDevice(stage.lan_port).pair(code)["ok"], "nobody else waits, and the code is not used up"

@@ -74,6 +74,15 @@ def test_phase_and_rules_last_one_run_and_roles_longer(tmp_path: Path, monkeypat
     assert begins("run-1") == "done", "its coordinator was killed"
     assert begins("run-2") == "work", "a new fleet up"
     assert CoordinatorStateFile("fleet", "tcp/y", "run-1").load() == PersistedPolicy()
+    file = CoordinatorStateFile("fleet", "tcp/x", "run-1")
+    assert file.path is not None
+    file.path.unlink()
+    file.path.mkdir()  # it cannot be written
+    state = to_persisted(PLAN, run.memory, run.now, 1000.0)
+    assert [file.save(state), file.save(state)] == [False, False]
+    file.path.rmdir()
+    assert file.save(state)
+    assert file.load() == state
 
 
 def test_restarted_plan_begins_with_its_first_phase() -> None:
