@@ -18,7 +18,7 @@ from fleet.hub.join_code import JoinCode
 
 JOIN_SERVICE: Final = "_car-fleet-hub._tcp.local."
 SEARCH_S: Final = 3.0
-"""Maximum time to look for a hub. The queries are sent after 0, 1 and 3 s."""
+"""Maximum time to look for a hub. Within it, zeroconf asks twice: at once, and after 1 s."""
 MAX_FOUND_HUBS: Final = 16
 """Maximum number of hubs that are tried."""
 _RESOLVE_MS: Final = 1000
@@ -35,33 +35,33 @@ def announced(port: int, code: JoinCode, addresses: Sequence[str]) -> Iterator[b
         port=port,
     )
     try:
-        server = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
+        zeroconf = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
     except OSError:
         yield False
         return
     try:
-        server.register_service(info, allow_name_change=True)
+        zeroconf.register_service(info, allow_name_change=True)
         yield True
     finally:
-        server.close()
+        zeroconf.close()
 
 
 def hubs_found(addresses: Iterable[str], timeout_s: float = SEARCH_S) -> Iterator[str]:
     """Yield host:port of hubs that wait for somebody, as they are found. `addresses` are those of this computer."""
     try:
-        browser = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
+        zeroconf = Zeroconf(interfaces=list(addresses), ip_version=IPVersion.V4Only)
     except OSError:
         return
     heard: deque[str] = deque(maxlen=MAX_FOUND_HUBS)
     seen: set[str] = set()
     try:
-        ServiceBrowser(browser, JOIN_SERVICE, handlers=[lambda **found: heard.append(str(found["name"]))])
+        ServiceBrowser(zeroconf, JOIN_SERVICE, handlers=[lambda **found: heard.append(str(found["name"]))])
         until = time.monotonic() + timeout_s
         while time.monotonic() < until and len(seen) < MAX_FOUND_HUBS:
             if not heard:
                 time.sleep(_SEARCH_POLL_S)
                 continue
-            info = browser.get_service_info(JOIN_SERVICE, heard.popleft(), _RESOLVE_MS)
+            info = zeroconf.get_service_info(JOIN_SERVICE, heard.popleft(), _RESOLVE_MS)
             places = [] if info is None else [f"{each}:{info.port}" for each in info.parsed_addresses(IPVersion.V4Only)]
             for where in places:
                 if where not in seen and len(seen) < MAX_FOUND_HUBS:
@@ -69,9 +69,9 @@ def hubs_found(addresses: Iterable[str], timeout_s: float = SEARCH_S) -> Iterato
                     yield where
     finally:
         with suppress(OSError):
-            browser.close()
+            zeroconf.close()
 
 
 def _instance(code: JoinCode) -> str:
-    """Return the name of an announcement. The beginning of the authority's fingerprint is not a secret."""
+    """Return the name of an announcement: the beginning of the authority's fingerprint, which is not a secret."""
     return f"hub-{code.pin[:8].lower()}"

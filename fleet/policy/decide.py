@@ -7,11 +7,12 @@ people drive. So most of this module is about *not* acting.
 First: whose car is it? The coordinator has the lowest rank. A car is left alone, whatever the plan says, if a person
 holds, drives, has paused or borrowed it, if an e-stop is in force, or if it cannot be reached or is not in a known
 state. This module calls such a reason a *barrier*. Each barrier has a sentence for the person who asks why nothing
-happens. A car that is out of reach keeps its role for a while, because links come back within seconds. A role that is
-vacant for a moment is better than a fleet whose roles change at every short loss of a link.
+happens. A car that is out of reach keeps its role for a while, because links come back within seconds. A role that
+nobody carries out for a moment is better than a fleet whose roles change at every short loss of a link.
 
-Second: what is true? Rules are evaluated in every step. But a rule comes into force only when its condition has been
-true for a time, and ends only when it has not been true for a time (`debounce`, `rules`). A comparison with a value
+Second: what is true? Rules are evaluated in every step. A rule comes into force when its condition has been true for
+the time that the plan wants. It ends when the condition has not been true for a time or, if it has an `until`, when
+that is true (`debounce`, `rules`). A comparison with a value
 that was not measured is unknown, and unknown does not count as true: no rule begins because of something that nobody
 has seen.
 
@@ -97,7 +98,10 @@ class DecisionStep(Struct, frozen=True):
 
     memory: PolicyState
     decisions: tuple[Decision, ...] = ()
-    """One for each car of the plan, one for each role, and one for the phase."""
+    """One for each car of the plan, one for each role, and one for the phase if there is one.
+
+    Empty while the first states are awaited.
+    """
     changed: tuple[Decision, ...] = ()
     """The decisions with a new cause."""
     reworded: tuple[Decision, ...] = ()
@@ -151,12 +155,13 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
         now=now,
     )
     allocation = allocate(candidates)
-    held_roles = _hold_roles(candidates, allocation, memory.held_roles, barriers)
+    held_roles = _keep_roles(candidates, allocation, memory.held_roles, barriers)
     overrides = _overrides(plan, snapshot, rules, subjects, allocation.roles, candidates.pinned)
     decisions = [explain_phase(plan, phase, snapshot)] if phase.name else []
     for car in subjects:
         if car in barriers:
-            # `on_hub_back` sets a time in the future: its longer grace period applies until that time has come.
+            # After a loss of the hub, `on_hub_back` puts this time into the future, so that cars keep their roles for
+            # HUB_RETURN_GRACE_S.
             kept_s = ROLE_KEPT_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
             decisions.append(explain_alone(car, barriers[car], reserved.get(car), kept_s))
         elif car in overrides:
@@ -202,7 +207,8 @@ def _step_stopped(
             decisions.append(explain_stopped(car, memory.stopped_by, rests=not must_rest))
     decisions += [explain_stopped_role(name, memory.stopped_by) for name in plan.roles]
     decisions = [each.after(memory.decisions.get(each.subject), now) for each in decisions]
-    to_rest = frozenset(mode_attempts) | (memory.to_rest - set(subjects))
+    missing = memory.to_rest - set(subjects)  # they come to rest when they are back
+    to_rest = frozenset(mode_attempts) | missing
     return _conclude(replace(memory, mode_attempts=mode_attempts, to_rest=to_rest), decisions, commands, {})
 
 
@@ -214,7 +220,8 @@ def _must_rest(known: CarSnapshot, attempts: ModeAttempts, barrier: Barrier | No
     # the earlier one is over.
     was_obeyed = attempts.count > 0 and not known.busy and known.refused is None
     is_at_rest = known.mode == Mode.MANUAL and known.verdict != Verdict.CONTRADICTED
-    return barrier is not None or not (was_obeyed and is_at_rest)
+    cannot_be_commanded = barrier is not None  # so nothing shows yet that it is at rest
+    return cannot_be_commanded or not (was_obeyed and is_at_rest)
 
 
 def _conclude(
@@ -341,7 +348,7 @@ def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...
     result: dict[str, PinnedRole] = {}
     for _, rule, state, effect in _effects_in_force(plan, rules):
         if effect.role is not None:
-            for car in targets(effect, state, subjects, {}):
+            for car in targets(effect, state, subjects, {}):  # the parser refuses an effect that gives a role a role
                 result.setdefault(car, PinnedRole(effect.role, rule.name))
     return result
 
@@ -356,7 +363,7 @@ def _overrides(
 ) -> dict[str, Override]:
     """Return the modes that rules in force give cars, whatever their roles say. The first rule applies.
 
-    A rule for several cars skips cars that do not know its mode, because they would refuse it again and again.
+    A rule skips cars that do not know its mode, or may not be in it. They would refuse it again and again.
     """
     result: dict[str, Override] = {}
     decided: set[str] = set()
@@ -375,7 +382,7 @@ def _overrides(
 # ---------------------------------------------------------------------- roles
 
 
-def _hold_roles(
+def _keep_roles(
     candidates: Candidates, allocation: RoleAllocation, before: Mapping[str, HeldRole], barriers: Mapping[str, Barrier]
 ) -> dict[str, HeldRole]:
     """Return the role of each car, and how it got that role."""
@@ -390,9 +397,9 @@ def _hold_roles(
             result[car] = last
             continue
         # A role for all cars has a place for each, so no car replaces another.
-        gone = lost[name].pop(0) if lost[name] and candidates.plan.roles[name].count is not None else None
-        words = "" if gone is None else _explain_loss(gone, name, candidates, allocation, barriers)
-        result[car] = explain_origin(car, name, candidates, gone, words)
+        predecessor = lost[name].pop(0) if lost[name] and candidates.plan.roles[name].count is not None else None
+        words = "" if predecessor is None else _explain_loss(predecessor, name, candidates, allocation, barriers)
+        result[car] = explain_origin(car, name, candidates, predecessor, words)
     return result
 
 
@@ -452,7 +459,7 @@ def _command_modes(
     for decision in decisions:
         car, mode = decision.car, decision.mode
         if car is None or mode is None:
-            continue  # the car is left alone, so its attempts end
+            continue  # it is about a role or the phase, or the car is left alone, so that its attempts end
         known = snapshot.cars.get(car, UNKNOWN_CAR)
         attempts = before.get(car, ModeAttempts(mode))
         if attempts.mode != mode:
@@ -512,7 +519,7 @@ def _command_blinks(
     allocation: RoleAllocation,
     before: Mapping[str, BlinkState],
 ) -> tuple[dict[str, BlinkState], list[CarCommand]]:
-    """Switch each blinking LED when its time is over, and switch off LEDs that no longer blink."""
+    """Switch each blinking LED when its time is over. Switch it off when it no longer blinks, if the car obeys then."""
     subjects = tuple(sorted({*candidates.free, *candidates.reserved}))
     now, result, commands = candidates.now, dict[str, BlinkState](), list[CarCommand]()
     for _, _, state, effect in _effects_in_force(plan, rules):

@@ -15,10 +15,10 @@ from gateway.drivers.yahboom.protocol.frames import (
     ColorLed,
     Frame,
     General,
+    LoneHash,
     ModeClose,
     ModeOpen,
     Ptz,
-    Reset,
     encode,
     parse_sent,
 )
@@ -161,7 +161,7 @@ def moves(frame: Frame) -> bool:
             return motion is not Motion.STOP
         case ModeOpen():
             return True
-        case Ptz() | ColorLed() | ModeClose() | ArmSet() | Reset():
+        case Ptz() | ColorLed() | ModeClose() | ArmSet() | LoneHash():
             return False
 
 
@@ -188,7 +188,7 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
             lines.append("its motors are off and it is in mode 0, as soon as it is not busy (4.3 s in avoidance)")
         case Ptz() | ColorLed() | ArmSet():
             lines.append("its motors do not change; in a mode other than 0 it ignores this")
-        case Reset():
+        case LoneHash():
             lines.append("this ended half a frame in the car's buffer, and the car may have obeyed that half")
         case None:
             lines.append(

@@ -34,7 +34,7 @@ from gateway.control.commands import (
 )
 from gateway.control.control_output import CommandRecord, OutgoingFrame
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
-from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen, Reset
+from gateway.drivers.yahboom.protocol.frames import Frame, General, LoneHash, ModeClose, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from schemas.commands import Verb
 from schemas.rights import NO_PEOPLE, Estop, FleetPause, People, Sender
@@ -283,7 +283,7 @@ class Wild:
         known = control.driver.model.profile.refusal(frame) is None
         assert known or (self.doubted and isinstance(frame, ModeClose)), "only what the platform knows"
         if write.why in (FrameOrigin.COMMAND, FrameOrigin.REPEAT) and not isinstance(frame, ModeClose):
-            stopping = isinstance(frame, Reset) or frame == General(Motion.STOP)
+            stopping = isinstance(frame, LoneHash) or frame == General(Motion.STOP)
             assert self.now >= self.free_at - 1e-9 or stopping, "not into a block of ours"
         self._check_motion(write)
         self._check_once(frame, write.why)
@@ -322,7 +322,7 @@ class Wild:
                 "speed": frame.speed is not None,
                 "servo": frame.servo is not None,
             }
-        elif not isinstance(frame, ModeOpen | ModeClose | Reset):
+        elif not isinstance(frame, ModeOpen | ModeClose | LoneHash):
             clears = why is not FrameOrigin.COMMAND and frame == self.control.driver.model.believed.led
             acts = {"named": not clears}  # a stop may send the color that the car has
         for name, done in acts.items():
@@ -373,7 +373,7 @@ def until_off(control: Control, now: float) -> CommandRecord | None:
             frame = write.frame
             # The color clears a string that begins with `4WD,`. It is the one that the car has.
             clears = frame == control.driver.model.believed.led
-            assert isinstance(frame, Reset | ModeClose) or frame == General(Motion.STOP) or clears, frame
+            assert isinstance(frame, LoneHash | ModeClose) or frame == General(Motion.STOP) or clears, frame
             control.driver.on_written(write, now)
             report_at += 1.0 if isinstance(frame, ModeClose) and not pi else 0.0
         for record in control.take_records():

@@ -37,7 +37,7 @@ from fleet.recording.tools.analysis import (
     stray_tables,
     warn_of_modes,
 )
-from fleet.recording.tools.mode_spans import MODE, ModeSpan, sensor_of, spans_without
+from fleet.recording.tools.mode_spans import MODE_TOPIC, ModeSpan, sensor_of, spans_without
 from schemas.keys import DEFAULT_FLEET
 from schemas.suggestion import did_you_mean
 
@@ -351,7 +351,7 @@ class Session:
         """
         if not sensor_of(of):
             raise NoTable(f"{of} does not name one sensor, such as sensor/range.")
-        return data_frame(spans_table(self._spans_without(of, self.to_arrow(MODE.name))))
+        return data_frame(spans_table(self._spans_without(of, self.to_arrow(MODE_TOPIC.name))))
 
     def _spans_without(self, of: str, modes: "pa.Table") -> list[ModeSpan]:
         """Return the times without this reading of the cars that `of` names. `modes` is a table of `state/mode`."""

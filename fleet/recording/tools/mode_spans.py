@@ -1,7 +1,8 @@
 """Finds when cars were in a mode in which a reading does not exist, from their `state/mode`. Pure.
 
-A car sends only what its mode needs (docs/reference/modes.md#what-a-car-reports-in-a-mode). So a table of distances has
-no rows at all from obstacle avoidance, and nobody would notice that they are missing.
+In most modes, a car sends few readings or none (docs/reference/modes.md#what-a-car-reports-in-a-mode). In obstacle
+avoidance, it measures the distance, but does not send it. So a table of distances has no rows at all from this mode,
+and nobody would notice that they are missing.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,10 +15,10 @@ from gateway import drivers
 from schemas.topics import FROM_OUTSIDE, TOPICS
 from schemas.words import UNKNOWN, Mode, Verdict
 
-MODE: Final = TOPICS["state/mode"]
-assert MODE.stale_after_s is not None
-_HOLDS_NS: Final = round(MODE.stale_after_s * 1e9)
-"""A state lasts until the next one, or until it is stale."""
+MODE_TOPIC: Final = TOPICS["state/mode"]
+assert MODE_TOPIC.stale_after_s is not None
+_HOLDS_NS: Final = round(MODE_TOPIC.stale_after_s * 1e9)
+"""A state lasts until the next one, but not longer than until it is stale. The last state of a car has no length."""
 
 
 class ModeSpan(Struct, frozen=True):

@@ -22,20 +22,20 @@ from schemas import keys
 from schemas.local_time import clock
 from schemas.words import Basis, Phase
 
-_REFUSED_PHASES: Final = (Phase.REJECTED, Phase.FAILED)
+_NOT_CARRIED_OUT_PHASES: Final = (Phase.REJECTED, Phase.FAILED)
 
 
 class SessionCheckup(Struct):
-    """Counts of one session, by car."""
+    """Counts of one session."""
 
     stops: Counter[str] = field(default_factory=Counter)
     """Ended stops by `shown`, `sent` or `failed`."""
     unshown: StopFindings = field(default_factory=StopFindings)
     """Stops that a car did not show, or that did not stop it."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Refused commands by reason, without stops."""
+    """Refused and failed commands by reason, without stops."""
     broken: Counter[str] = field(default_factory=Counter)
-    """Lost links."""
+    """Lost links by car."""
     car: str = ""
     """The only car to look at. Empty for all cars."""
     cars: set[str] = field(default_factory=set)
@@ -64,7 +64,7 @@ class SessionCheckup(Struct):
             is_stop = stops_cars(message)
             if is_stop and (message.basis or message.phase == Phase.FAILED):
                 self.stops[message.basis or Phase.FAILED] += 1
-            if message.phase in _REFUSED_PHASES and not is_stop:
+            if message.phase in _NOT_CARRIED_OUT_PHASES and not is_stop:
                 self.refused[message.reason or message.phase] += 1
 
     def findings(self, verdict: SessionVerdict, name: str) -> Iterator[DoctorFinding]:
@@ -81,9 +81,9 @@ class SessionCheckup(Struct):
             yield DoctorFinding("damage", f"Damaged: {words}.", f"fleet sessions recover {name}")
         if verdict.ended:
             yield DoctorFinding("not_closed", f"{verdict.ended[0].upper()}{verdict.ended[1:]}.", verify)
-        if lost := sum(verdict.dropped.values()):
+        if dropped := sum(verdict.dropped.values()):
             yield DoctorFinding(
-                "recorder_drops", f"The recorder dropped {lost} messages: its disk was full or too slow.", verify
+                "recorder_drops", f"The recorder dropped {dropped} messages: its disk was full or too slow.", verify
             )
         if verdict.missing_count:
             worst = max(verdict.missing, key=lambda gap: gap["count"])
@@ -102,7 +102,7 @@ class SessionCheckup(Struct):
         yield "stops", ", ".join(f"{self.stops[basis]} {basis}" for basis in (*Basis, Phase.FAILED))
         yield "refused", _most(self.refused) or "none"
         yield "links lost", _most(self.broken) or "none"
-        steps = len(verdict.backwards) + sum(clock.backwards for clock in verdict.clocks.values())
+        steps = len(verdict.backwards) + sum(each.backwards for each in verdict.clocks.values())
         yield "clock steps", str(steps)
 
     def as_dict(self, verdict: SessionVerdict, name: str) -> dict[str, Any]:

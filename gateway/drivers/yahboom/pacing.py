@@ -26,7 +26,7 @@ from enum import IntEnum
 from typing import Final
 
 from gateway.drivers.yahboom.estimate.learned import Learned, blocking_kind
-from gateway.drivers.yahboom.protocol.frames import ArmSet, Frame, General, Reset
+from gateway.drivers.yahboom.protocol.frames import ArmSet, Frame, General, LoneHash
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
 from schemas.words import Platform, ServoAction
@@ -86,7 +86,7 @@ class Pacing:
         self._earlier_block_s = max(self._earlier_block_s, self._block_s) if now < self._read_by else 0.0
         self._read_by = min(awake_at + FLIGHT_S, max(now + REPEAT_INTERVAL_S, self.block_until))
         self._written_at = now
-        if not isinstance(frame, Reset):
+        if not isinstance(frame, LoneHash):
             self._framed_at = now
         self._block_s = self.longest_block_s(frame)
         self._sure_block_s = self._block_s if self._surely_blocks(frame) else 0.0
@@ -129,7 +129,7 @@ class Pacing:
 
     def earliest_named_at(self, frame: Frame) -> float:
         """Return the earliest time for a named frame, which the car must not read together with the one before it."""
-        return float("-inf") if isinstance(frame, General | Reset) else self._framed_at + NAMED_GAP_S
+        return float("-inf") if isinstance(frame, General | LoneHash) else self._framed_at + NAMED_GAP_S
 
     @property
     def written_at(self) -> float:

@@ -53,7 +53,7 @@ class ArduinoCar(ModeCar):
             if self._mode is Mode.MANUAL:
                 yield from self._manual()
             else:
-                yield from self._mode_turn()
+                yield from self._run_mode_once()
 
     # From the host.
 
@@ -201,7 +201,7 @@ class ArduinoCar(ModeCar):
             yield Wait(room_at)
         self._send(data)
 
-    def _turn(self, fields: str) -> Program:
+    def _print_and_wait(self, fields: str) -> Program:
         """Send the frame of one loop turn in modes 2, 5 and 6, at the rate of the UART."""
         frame = self._frame(fields)
         if self._mode is Mode.FOLLOWING:

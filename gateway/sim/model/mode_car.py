@@ -25,7 +25,7 @@ from schemas.words import Mode
 
 BOOT_S: Final = 0.5
 AVOIDANCE_RANGINGS: Final = 5
-SHARP_S: Final = 0.08
+SHARP_TURN_S: Final = 0.08
 FAR_CM: Final = 500.0
 """In avoidance, the program discards a distance of this or more, as if there were no echo."""
 
@@ -38,7 +38,7 @@ MODE_OF_DIGIT: Final = {
     "5": Mode.LIGHT_SEEKING,
     "6": Mode.FOLLOWING,
 }
-"""The modes by the x of `MODE<x><y>`. The functions that `_mode_turn` calls say what a car does in each."""
+"""The modes by the x of `MODE<x><y>`. The functions that `_run_mode_once` calls say what a car does in each."""
 
 ARDUINO_LIGHTS: Final = {
     "1": (255, 255, 255),
@@ -82,8 +82,8 @@ class ModeCar(Firmware):
         self._color_position = 0
 
     def _reboot(self) -> Program:
-        # A reboot resets the mode, the motion, the speed, the light and the fan, and clears both buffers. The servo and
-        # the arm stay at their positions.
+        # `brown_out` has reset the mode, the motion, the light and the fan, and cleared the buffers. The servo and the
+        # arm stay at their positions.
         self._reset_variables()
         yield Wait(self._now + BOOT_S)
         self._buffer.clear()  # the UART is off while it boots
@@ -100,7 +100,7 @@ class ModeCar(Firmware):
     def _is_silent(self) -> bool:
         return self._mode in self._traits.silent_modes
 
-    def _turn(self, fields: str) -> Program:
+    def _print_and_wait(self, fields: str) -> Program:
         """Print the frame of one loop turn in modes 2, 5 and 6, and wait for the time of that turn."""
         raise NotImplementedError
 
@@ -110,7 +110,7 @@ class ModeCar(Firmware):
     def _slower(self) -> None:
         raise NotImplementedError
 
-    def _mode_turn(self) -> Program:
+    def _run_mode_once(self) -> Program:
         """Run one loop turn of the current mode, which is not mode 0."""
         match self._mode:
             case Mode.TRACKING:
@@ -157,7 +157,7 @@ class ModeCar(Firmware):
                 left, right = SIGNS[button]
                 self._drive(left * self._pwm(), right * self._pwm())
 
-    # The other modes. Each sets the speed, and this speed still applies in mode 0 afterwards.
+    # The other modes. On an Arduino car, `_go` also sets the speed that still applies in mode 0 afterwards.
 
     def _go(self, left: int, right: int, speed: int) -> None:
         self._speed = speed
@@ -166,13 +166,13 @@ class ModeCar(Firmware):
     def _tracking(self) -> Program:
         line = self._body.line(self._now)
         left_outer, left_inner, right_inner, right_outer = line
-        yield from self._turn(f"CSB0,PV8,GS0,LF{bits(line)},HW00,GM00")
+        yield from self._print_and_wait(f"CSB0,PV8,GS0,LF{bits(line)},HW00,GM00")
         if (left_outer or left_inner) and right_outer:
             self._go(1, -1, 250)
-            yield from self._busy(SHARP_S)
+            yield from self._busy(SHARP_TURN_S)
         elif left_outer and right_inner:
             self._go(-1, 1, 250)
-            yield from self._busy(SHARP_S)
+            yield from self._busy(SHARP_TURN_S)
         elif left_outer:
             self._go(-1, 1, 150)
         elif right_outer:
@@ -187,16 +187,16 @@ class ModeCar(Firmware):
 
     def _light_seeking(self) -> Program:
         seen = self._body.light(self._now)
-        yield from self._turn(f"CSB120,PV8.3,GS000,LF0000,HW00,GM{bits(seen)}")
-        left, right = seen
-        self._go(*((1, 1) if left and right else (0, 1) if left else (1, 0) if right else (0, 0)), 200)
+        yield from self._print_and_wait(f"CSB120,PV8.3,GS000,LF0000,HW00,GM{bits(seen)}")
+        wheels = {(True, True): (1, 1), (True, False): (0, 1), (False, True): (1, 0), (False, False): (0, 0)}
+        self._go(*wheels[seen], 200)
 
     def _following(self) -> Program:
         """Follow an object (row "6 following"). The frames have no `#`, and inverted bits, where 0 = object seen."""
         seen = self._body.obstacle(self._now)
-        yield from self._turn(f"CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
-        left, right = seen
-        self._go(*((1, 1) if left and right else (-1, 1) if left else (1, -1) if right else (0, 0)), 200)
+        yield from self._print_and_wait(f"CSB120,PV8.3,GS000,LF0000,HW{bits((not seen[0], not seen[1]))},GM00")
+        wheels = {(True, True): (1, 1), (True, False): (-1, 1), (False, True): (1, -1), (False, False): (0, 0)}
+        self._go(*wheels[seen], 200)
 
     def _color_led(self) -> Program:
         yield from self._turn_servo(self._color_position)

@@ -58,7 +58,7 @@ class Stm32Car(ModeCar):
                 if self._mode is Mode.MANUAL:
                     yield from self._manual()
                 else:
-                    yield from self._mode_turn()
+                    yield from self._run_mode_once()
             except _TurnEnded:
                 continue
 
@@ -170,7 +170,7 @@ class Stm32Car(ModeCar):
         # The main loop waits until each byte is sent, and does not read the buffer meanwhile.
         yield Wait(max(self._now, self._tx_free))
 
-    def _turn(self, fields: str) -> Program:
+    def _print_and_wait(self, fields: str) -> Program:
         if self._is_silent:
             yield from self._busy(SILENT_TURN_S)
         else:

@@ -25,7 +25,7 @@ class EncodeError(ValueError):
 class Dialect(Struct, frozen=True):
     """The spelling of the frames of one program.
 
-    `head` is the first word of readings and of named frames (all but `General` and `Reset`). With
+    `head` is the first word of readings and of named frames (all but `General` and `LoneHash`). With
     `swaps_green_and_blue`, place 7 has 3 for blue and 4 for green
     (docs/reference/protocol.md#programs-that-people-have).
     """
@@ -40,8 +40,8 @@ STANDARD: Final = Dialect()
 class General(Struct, frozen=True):
     """The nine-field frame. It always carries a motion.
 
-    All other fields are one-shot: if they are sent again, they act again (the fan toggles, the speed increases). If a
-    program reads `fan` as a level, it is that level (`Profile.fan_is_level`).
+    All other fields but `light` are one-shot: if they are sent again, they act again (the fan toggles, the speed
+    increases). To a program with `Profile.fan_is_level`, `fan` is no one-shot: True turns the fan on, False off.
     """
 
     motion: Motion
@@ -88,12 +88,15 @@ class ArmSet(Struct, frozen=True):
     joint_deg: tuple[int, ...]
 
 
-class Reset(Struct, frozen=True):
-    """A lone `#`. It ends a truncated frame in the car's buffer. If the buffer is empty, it stops a car in mode 0."""
+class LoneHash(Struct, frozen=True):
+    """A lone `#`. It ends half a frame in the car's buffer, and the car obeys the motion of that half.
+
+    If the buffer is empty, it stops a car in mode 0.
+    """
 
 
 _Word = TypeVar("_Word", bound=StrEnum)
-Frame = General | Ptz | ColorLed | ModeOpen | ModeClose | ArmSet | Reset
+Frame = General | Ptz | ColorLed | ModeOpen | ModeClose | ArmSet | LoneHash
 
 
 def encode(frame: Frame, dialect: Dialect = STANDARD) -> bytes:
@@ -101,7 +104,7 @@ def encode(frame: Frame, dialect: Dialect = STANDARD) -> bytes:
     match frame:
         case General():
             return _encode_general(frame, dialect)
-        case Reset():
+        case LoneHash():
             return b"#"
         case _:
             return b"$%b,%b#" % (dialect.head.encode(), _encode_named(frame))
@@ -117,7 +120,8 @@ def _encode_named(frame: Ptz | ColorLed | ModeOpen | ModeClose | ArmSet) -> byte
         case ModeOpen(mode):
             digit = MODES[_check_member("mode", mode, Mode)].digit
             if not digit:
-                raise EncodeError("mode: 'manual' cannot be opened (MODE01); allowed are the other six, or close it")
+                words = "Close a mode with ModeClose, or open one of the other six"
+                raise EncodeError(f"mode: manual cannot be opened (MODE01). {words}")
             return b"MODE%d1" % digit
         case ModeClose(mode):
             return b"MODE%d0" % MODES[_check_member("mode", mode, Mode)].digit
@@ -135,14 +139,14 @@ def parse_sent(data: bytes, dialect: Dialect = STANDARD) -> Frame | None:
     MODE01, and a servo that moves (place 5) and resets (place 9) at once.
     """
     if data == b"#":
-        return Reset()
+        return LoneHash()
     if found := _GENERAL.fullmatch(data):
         return _parse_general(dialect, *map(int, found.groups()))
     head = f"${dialect.head},".encode()
     if data.startswith(head) and (found := _NAMED.fullmatch(data, len(head))):
         frame = _parse_named({name: int(text) for name, text in found.groupdict().items() if text is not None})
         try:
-            encode(frame)
+            encode(frame)  # the pattern allows numbers that are out of range
         except EncodeError:
             return None
         return frame

@@ -17,10 +17,10 @@ from gateway.drivers.yahboom.protocol.frames import (
     Dialect,
     Frame,
     General,
+    LoneHash,
     ModeClose,
     ModeOpen,
     Ptz,
-    Reset,
     encode,
     parse_sent,
 )
@@ -266,7 +266,7 @@ class Profile(Struct, frozen=True, dict=True):
                 return f"{self._these} may ignore the frame that closes mode {mode}"
             case ArmSet():
                 return self._unless("arm", "the arm frame (an option: +arm)")
-            case Reset():
+            case LoneHash():
                 # hazards of the Raspberry Pi programs: a lone `#` is never sent to this platform
                 return self._unless("mode", "a lone '#'")
 

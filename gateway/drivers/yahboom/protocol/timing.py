@@ -6,7 +6,7 @@ Every number is a row of docs/reference/protocol.md#blocking-times unless a comm
 
 from typing import Final
 
-from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeClose, ModeOpen, Ptz, Reset
+from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, LoneHash, ModeClose, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.modes import MODES
 
 # framing: UART 9600 8N1, so at most 960 bytes/s each way
@@ -46,5 +46,5 @@ def block_s(frame: Frame, *, fan_s: float = 0.0) -> float:
             return MODES[mode].open_s
         case ModeClose():
             return MODE_CLOSE_S
-        case Reset():  # docs/reference/protocol.md has no row for a lone `#`: assumed as a stop, because it acts as one
+        case LoneHash():  # docs/reference/protocol.md has no row for it: assumed as a stop, because it acts as one
             return FRAME_S

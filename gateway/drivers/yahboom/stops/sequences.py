@@ -5,7 +5,7 @@ from typing import Final
 from msgspec import Struct
 
 from gateway.drivers.yahboom.pacing import NAMED_GAP_S, Gate
-from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Reset
+from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, LoneHash, ModeClose
 from gateway.drivers.yahboom.protocol.timing import COLOR_S, FRAME_S, RECOVERY_SILENCE_S, REPEAT_INTERVAL_S
 from schemas.words import Motion
 
@@ -80,7 +80,7 @@ RECOVERY: Final = StopSequence(
     "recovery",
     3,
     (
-        Step(Reset()),
+        Step(LoneHash()),
         Step(_MANUAL, after_s=0.05),
         Step(_MANUAL, after_s=RECOVERY_SILENCE_S - 0.05),
         Step(STOP_FRAME, after_s=REPEAT_INTERVAL_S),

@@ -10,10 +10,10 @@ from gateway.drivers.yahboom.protocol.frames import (
     EncodeError,
     Frame,
     General,
+    LoneHash,
     ModeClose,
     ModeOpen,
     Ptz,
-    Reset,
     encode,
     parse_sent,
 )
@@ -50,7 +50,7 @@ def named(row: dict[str, str]) -> Frame:
         case "arm":
             return ArmSet(tuple(map(int, values)))
         case "reset":
-            return Reset()
+            return LoneHash()
         case _:
             raise AssertionError(row)
 
@@ -106,7 +106,7 @@ FRAMES = st.one_of(
     st.builds(ModeOpen, st.sampled_from([mode for mode in Mode if mode is not Mode.MANUAL])),
     st.builds(ModeClose),
     st.builds(ArmSet, st.tuples(*[st.integers(0, 180)] * 6)),
-    st.builds(Reset),
+    st.builds(LoneHash),
 )
 
 
@@ -116,7 +116,7 @@ def test_encode_and_parse_are_inverse(frame: Frame) -> None:
     assert parse_sent(data) == frame
     if isinstance(frame, General):
         assert len(data) == 19
-    assert len(data) <= 20 or not isinstance(frame, (General, Ptz, ModeOpen, ModeClose, Reset))
+    assert len(data) <= 20 or not isinstance(frame, (General, Ptz, ModeOpen, ModeClose, LoneHash))
 
 
 @pytest.mark.parametrize(

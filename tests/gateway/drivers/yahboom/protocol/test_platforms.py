@@ -6,7 +6,16 @@ import pytest
 
 from gateway.control.driver import Rejected
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
-from gateway.drivers.yahboom.protocol.frames import ArmSet, Dialect, Frame, General, ModeClose, Ptz, Reset, parse_sent
+from gateway.drivers.yahboom.protocol.frames import (
+    ArmSet,
+    Dialect,
+    Frame,
+    General,
+    LoneHash,
+    ModeClose,
+    Ptz,
+    parse_sent,
+)
 from gateway.drivers.yahboom.protocol.measurements import verdict_of
 from gateway.drivers.yahboom.protocol.modes import EVERY_MEASUREMENT, MODES, candidate_modes, only_candidate
 from gateway.drivers.yahboom.protocol.platforms import StopStyle, parse_platform
@@ -235,7 +244,7 @@ SPELLED: list[tuple[str, Frame, bytes]] = [
     ("stm32+head=BaLa", ModeClose(), b"$BaLa,MODE00#"),
     ("arduino+head=3WD", Ptz(30), b"$3WD,PTZ30#"),
     ("arduino+head=3WD+arm", ArmSet((1, 2, 3, 4, 5, 6)), b"$3WD,ServoJ11,J22,J33,J44,J55,J66#"),
-    ("arduino+head=3WD", Reset(), b"#"),
+    ("arduino+head=3WD", LoneHash(), b"#"),
 ]
 
 
