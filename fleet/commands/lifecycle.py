@@ -19,7 +19,7 @@ from fleet.commands.command_group import chosen_person, say
 from fleet.commands.fleets import client_in, the_fleet
 from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option, not_running
-from fleet.supervisor.child import parse_log_line, runs_directory
+from fleet.supervisor.log_files import parse_log_line, runs_directory
 from fleet.supervisor.supervisor_service import ask_service
 from schemas import keys, messages
 from schemas.bus import Bus, BusError, Failure, messages_of, resolve_endpoint

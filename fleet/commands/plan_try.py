@@ -147,7 +147,7 @@ class _ReplanReport:
 
     def _refuse_without_cars(self) -> None:
         """Reject a session that was cut to some cars: messages on which the decisions depend are missing."""
-        from fleet.recording.tools.transform import origin_of
+        from fleet.recording.tools.merge_cut_recover import origin_of
 
         left = origin_of(self._session).get("cars")
         if not left:

@@ -10,9 +10,9 @@ import click
 from fleet.commands.output import echo_safely, with_progress
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.tools import one_schema, table_export
+from fleet.recording.tools.merge_cut_recover import atomic_directory
 from fleet.recording.tools.summary import total
 from fleet.recording.tools.table_formats import FORMATS, ParquetNsSink
-from fleet.recording.tools.transform import atomic_directory
 from fleet.replay.foxglove_layout import layout_text
 
 

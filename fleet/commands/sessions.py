@@ -64,8 +64,8 @@ required_out_option = _new_session_option(required=True, help="Write the new ses
 def _session_errors(out: Path | None = None) -> Iterator[None]:
     """Turn expected errors into one line."""
     from fleet.recording.reading.session import NoSession
+    from fleet.recording.tools.merge_cut_recover import Exists
     from fleet.recording.tools.table_formats import FormatMissing
-    from fleet.recording.tools.transform import Exists
 
     try:
         yield
@@ -191,8 +191,8 @@ def _size(count: int) -> str:
 @json_option
 def info(session: Path, *, as_json: bool) -> None:
     """Show what is in a session: versions, cars, keys with their rates, marks, lost messages."""
+    from fleet.recording.tools.merge_cut_recover import origin_words
     from fleet.recording.tools.summary import SessionState, marks_of, of_session, stops_of
-    from fleet.recording.tools.transform import origin_words
 
     with _session_errors():
         found = _open(session)
@@ -271,14 +271,14 @@ def verify(session: Path, *, as_json: bool) -> None:
 @out_option
 def recover(session: Path, out: Path | None) -> None:
     """Repair a damaged recording: copy everything readable into a new session."""
-    from fleet.recording.tools import transform
+    from fleet.recording.tools import merge_cut_recover
     from fleet.recording.tools.summary import total
 
     with _session_errors():
         found = _open(session)
     out = out or found.path.resolve().with_name(f"{found.name}-recovered")
     with _session_errors(out):
-        count, words = transform.recover(found, out, with_progress("recover", total(found)))
+        count, words = merge_cut_recover.recover(found, out, with_progress("recover", total(found)))
     echo_safely(f"{out}: {count} messages{f'; lost: {words}' if words else ', no message was damaged'}")
 
 
@@ -295,14 +295,14 @@ def merge(several: tuple[Path, ...], out: Path) -> None:
 
     A message that several recorders received is written once. The recorders' clocks decide the order of the messages.
     """
-    from fleet.recording.tools import transform
+    from fleet.recording.tools import merge_cut_recover
 
     if len({each.resolve() for each in several}) < 2:
         raise click.UsageError("name several sessions: fleet sessions merge ONE OTHER --out DIR")
     with _session_errors():
         found = [_open(each) for each in several]
     with _session_errors(out):
-        count, duplicates, lost = transform.merge(found, out, with_progress("merge", None))
+        count, duplicates, lost = merge_cut_recover.merge(found, out, with_progress("merge", None))
     echo_safely(f"{out}: {count} messages; {duplicates} duplicates left out{f'; lost: {lost}' if lost else ''}")
 
 
@@ -320,13 +320,13 @@ examples:
 @required_out_option
 def cut(session: Path, start: str | None, end: str | None, cars: tuple[str, ...], out: Path) -> None:
     """Copy a part of a session into a new session."""
-    from fleet.recording.tools import transform
+    from fleet.recording.tools import merge_cut_recover
 
     with _session_errors():
         found = _open(session)
         selection = part_of(found, start, end, cars)
     with _session_errors(out):
-        count = transform.cut(found, out, selection, cars, with_progress("cut", None))
+        count = merge_cut_recover.cut(found, out, selection, cars, with_progress("cut", None))
     echo_safely(f"{out}: {count} messages{f'; {found.damage_words}' if found.damage else ''}")
 
 

@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 from msgspec import Struct
 
-from fleet.hub.x509_parts import builder, common_name, end_entity, new_key, pem, private_pem
+from fleet.hub.certificate_parts import builder, common_name, end_entity, new_key, pem, private_pem
 from schemas.atomic_file import write_atomically
 from schemas.process.file_lock import FileLock
 from schemas.state_dir import default_directory

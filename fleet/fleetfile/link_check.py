@@ -19,7 +19,7 @@ from fleet.fleet_links import SimLink, may_be_same, parse_fleet_link
 from fleet.fleetfile.fleet_file import FleetCar
 from gateway import drivers
 from schemas.links import UsbUrl
-from schemas.process import port_lock
+from schemas.process import port_users
 from schemas.process.usb_bus import CH340, explain_missing_port
 from schemas.words import LinkState
 
@@ -96,11 +96,11 @@ def check_device(path: str) -> tuple[bool, str]:
     if not os.access(path, os.R_OK | os.W_OK):
         group = _group_name(file_stat.st_gid)
         return False, f"no permission: join the group {group} (sudo usermod -aG {group} $USER), then log in again"
-    holder = port_lock.find_holder(file_stat)
+    holder = port_users.find_holder(file_stat)
     if holder is not None:
         return False, f"in use by {holder}. Stop that program first."
-    free = "free" if port_lock.LOCKS.exists() else "whether it is free is not known here"
-    users = ", ".join(port_lock.find_users(path))
+    free = "free" if port_users.LOCKS.exists() else "whether it is free is not known here"
+    users = ", ".join(port_users.find_users(path))
     shared = f", but {users} has it open and may take its bytes: stop that" if users else ""
     return True, f"there, permitted, {free}{shared}; not opened, because that can reset a car"
 

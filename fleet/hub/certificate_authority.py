@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 from msgspec import Struct
 
-from fleet.hub.x509_parts import builder, common_name, end_entity, key_usage, new_key, pem, private_pem
+from fleet.hub.certificate_parts import builder, common_name, end_entity, key_usage, new_key, pem, private_pem
 from schemas.bus.certificate_dates import CertificateDates
 
 CA_LIFETIME: Final = timedelta(days=3650)

@@ -17,7 +17,7 @@ from msgspec import Struct, field, to_builtins
 from fleet.hub import certificate_authority
 from fleet.hub.access_rules import access_control
 from fleet.hub.certificate_authority import BadRequestForCertificate, KeyPair
-from fleet.hub.x509_parts import LIFETIME
+from fleet.hub.certificate_parts import LIFETIME
 from schemas.atomic_file import write_atomically
 from schemas.bus import BusError
 from schemas.bus.credentials import (

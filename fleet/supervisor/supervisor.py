@@ -24,7 +24,7 @@ from fleet.fleetfile.fleet_file import people_table
 from fleet.policy.denial_words import fleet_refusal
 from fleet.supervisor import spec
 from fleet.supervisor.car_status import CarStatus
-from fleet.supervisor.child import Log, new_run, remove_links, write_copy
+from fleet.supervisor.log_files import Log, new_run, remove_links, write_copy
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
 from fleet.supervisor.restart_policy import GATEWAY_GRACE_S

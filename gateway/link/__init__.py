@@ -1,9 +1,9 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.drivers` gives the bytes their meaning.
 
 `base` has the interfaces, `link_errors` the exceptions. `serial`, `tcp` and `ble` implement the interfaces; `tcp` and
-`ble` use the buffer of `buffered_link`. `ble_adapters` lets several gateways take turns at one Bluetooth adapter. `usb`
-finds the port of a USB device, `serial_ports` and `ble_devices` list ports and devices, `url` parses a link of the
-command line. `baud` finds out whether the baud rate may be wrong.
+`ble` use the buffer of `buffered_link`. `ble_adapter_turns` lets several gateways take turns at one Bluetooth adapter.
+`usb` finds the port of a USB device, `serial_port_list` and `ble_devices` list ports and devices, `url` parses a link
+of the command line. `baud` finds out whether the baud rate may be wrong.
 
 Each kind of link has a class of URLs in `schemas.links`, and here a module that is named like the scheme and has a
 `KIND`.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, TypeVar
 from schemas.links import LinkUrl
 
 if TYPE_CHECKING:
-    from gateway.link.serial_ports import SerialPort
+    from gateway.link.serial_port_list import SerialPort
 
 Url = TypeVar("Url", bound=LinkUrl)
 

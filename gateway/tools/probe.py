@@ -14,7 +14,7 @@ from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.drivers.yahboom.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT_S
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
-from gateway.link.serial_ports import SerialPort
+from gateway.link.serial_port_list import SerialPort
 from gateway.tools import cli_support
 from gateway.tools.statistics import LinkStatistics
 from schemas.words import LinkVerdict, Mode, Platform

@@ -11,8 +11,8 @@ import pytest
 from fleet.client.client import Fleet as Client
 from fleet.hub import certificate_authority
 from fleet.hub.certificate_authority import BadRequestForCertificate
+from fleet.hub.certificate_parts import LIFETIME
 from fleet.hub.hub_store import HubStore
-from fleet.hub.x509_parts import LIFETIME
 from schemas import keys
 from schemas.bus import Bus, Sample
 from schemas.bus.certificate_request import renew

@@ -18,8 +18,8 @@ from fleet.client.client import Fleet as Client
 from fleet.client.refused_by_hub import why_refused
 from fleet.commands import hub
 from fleet.hub import certificate_authority
+from fleet.hub.certificate_parts import LIFETIME
 from fleet.hub.hub_store import HubStore
-from fleet.hub.x509_parts import LIFETIME
 from schemas import keys
 from schemas.bus import Bus, BusError
 from schemas.commands import COMMANDS, STOPPING_VERBS, STOPS, Verb

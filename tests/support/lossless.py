@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.tools.transform import recover
+from fleet.recording.tools.merge_cut_recover import recover
 from fleet.recording.tools.verify import verify
 from schemas.bus import BusError
 from tests.support.processes import FleetProcesses, wait_for

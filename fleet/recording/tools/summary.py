@@ -15,7 +15,7 @@ from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
 from fleet.recording.session_lookup import find_session
 from fleet.recording.stop_count import EVENTS, StopCount
-from fleet.recording.tools.transform import lost_words
+from fleet.recording.tools.merge_cut_recover import lost_words
 from schemas import keys
 
 MARK_TOPIC_NAME: Final = "@recorder/mark"

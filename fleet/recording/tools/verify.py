@@ -11,7 +11,7 @@ from fleet.recording.reading.mcap_reader import ChannelInfo, Row
 from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema, message_of
 from fleet.recording.reading.session import Session
 from fleet.recording.sequence_tracker import PublisherSequence
-from fleet.recording.tools.transform import lost_words
+from fleet.recording.tools.merge_cut_recover import lost_words
 from schemas import keys
 from schemas.local_time import exact
 from schemas.printable import printable

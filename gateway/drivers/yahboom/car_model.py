@@ -18,7 +18,7 @@ from gateway.drivers.yahboom.pacing import FLIGHT_S, Pacing
 from gateway.drivers.yahboom.protocol.frames import ColorLed
 from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
-from gateway.drivers.yahboom.stops import cases, stop_in_progress
+from gateway.drivers.yahboom.stops import cases, stop_choice
 from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.drivers.yahboom.stops.evidence import StopEvidence
 from schemas.words import Basis, Blocking, CarTrust, Mode, Motion, Motors, Platform, Shows, Verdict
@@ -172,7 +172,7 @@ class CarModel:
     @property
     def stop_style(self) -> StopStyle:
         """Return the kind of stop for this car now."""
-        return stop_in_progress.style_of(self.profile, doubted=self.platform.doubted, open_mode=self.platform.open_mode)
+        return stop_choice.style_of(self.profile, doubted=self.platform.doubted, open_mode=self.platform.open_mode)
 
     def stop_case(self, *, is_soft: bool) -> StopCase:
         """Return the case that decides when a stop may end although the car has not shown it."""
@@ -242,11 +242,11 @@ class CarModel:
             return Shows.NO, cases.NO_REACTION.why(self.name)
         return Shows.UNKNOWN, cases.NOT_KNOWN.why(self.name)
 
-    def for_stop(self, now: float) -> stop_in_progress.StopContext:
+    def for_stop(self, now: float) -> stop_choice.StopContext:
         """Return the context for the choice of a stop."""
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
         clear, blocked = self.pacing.is_clear(now), self.pacing.is_blocked(now)
-        return stop_in_progress.StopContext(
+        return stop_choice.StopContext(
             self.profile,
             self.known,
             self.mode.asked,

@@ -14,7 +14,7 @@ from gateway.drivers.yahboom.pacing import FLIGHT_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ModeClose
 from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S
 from gateway.drivers.yahboom.stop_renewal import StopRenewal
-from gateway.drivers.yahboom.stops import cases, sequences, stop_in_progress
+from gateway.drivers.yahboom.stops import cases, sequences, stop_choice, stop_in_progress
 from gateway.drivers.yahboom.stops.cases import StopCase, StopFacts
 from gateway.drivers.yahboom.stops.evidence import EARLY_S, Finding
 from gateway.drivers.yahboom.stops.sequences import StopSequence
@@ -44,11 +44,11 @@ class StopExecutor:
 
     def soft(self, now: float) -> StopSequence:
         """Return the stop that ends a drive."""
-        return stop_in_progress.soft(self.model.for_stop(now))
+        return stop_choice.soft(self.model.for_stop(now))
 
     def full(self, now: float) -> StopSequence:
         """Return the stop that `stop`, `estop` and a shutdown send."""
-        return stop_in_progress.full(self.model.for_stop(now))
+        return stop_choice.full(self.model.for_stop(now))
 
     def begin(self, sequence: StopSequence, why: FrameOrigin, now: float, pending: Pending | None = None) -> None:
         """Begin a stop, or join the running one if that is at least as strong."""
@@ -96,11 +96,11 @@ class StopExecutor:
 
     def begin_recovery(self, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
         """Begin the recovery sequence. It replaces any running stop."""
-        self._start(stop_in_progress.recovery(self.model.for_stop(now)), why, now, commands)
+        self._start(stop_choice.recovery(self.model.for_stop(now)), why, now, commands)
 
     def _start(self, sequence: StopSequence, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
         model = self.model
-        worst_s = stop_in_progress.worst_s(sequence, model.for_stop(now), model.pacing, now)
+        worst_s = stop_choice.worst_s(sequence, model.for_stop(now), model.pacing, now)
         timeout_s = min(worst_s, stop_in_progress.MAX_ANNOUNCED_WORST_S) + stop_in_progress.evidence_s(
             model.profile, model.learned
         )
@@ -241,9 +241,7 @@ class StopExecutor:
     def _try_again(self, running: StopInProgress, now: float) -> None:
         running.tries += 1
         context = self.model.for_stop(now)
-        running.begin_try(
-            stop_in_progress.soft(context) if running.at_rest else stop_in_progress.recovery(context), now
-        )
+        running.begin_try(stop_choice.soft(context) if running.at_rest else stop_choice.recovery(context), now)
         self.model.evidence.on_retry()
 
     def fail_late(self, running: StopInProgress, now: float) -> None:
@@ -435,7 +433,7 @@ class StopExecutor:
         sequence, running = self.full(now), self.running
         if running is not None and running.sequence.rank >= sequence.rank:
             return running.worst_s(now)
-        return stop_in_progress.worst_s(sequence, self.model.for_stop(now), self.model.pacing, now)
+        return stop_choice.worst_s(sequence, self.model.for_stop(now), self.model.pacing, now)
 
     def free_at(self, now: float) -> float:
         """Return when a motion can be sent to the car, as far as that is known."""

@@ -14,7 +14,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fleet.hub import certificate_authority
 from fleet.hub.certificate_authority import BadRequestForCertificate
-from fleet.hub.x509_parts import LIFETIME
+from fleet.hub.certificate_parts import LIFETIME
 from schemas.bus.certificate_dates import CertificateDates
 
 NOW = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from fleet.hub import certificate_authority
+from fleet.hub.certificate_parts import LIFETIME
 from fleet.hub.hub_store import BrokenHub, HubStore
-from fleet.hub.x509_parts import LIFETIME
 from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.identity import car, person
 

@@ -9,7 +9,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from rich.console import Console
 
 from fleet.supervisor.car_status import CarStatus
-from fleet.supervisor.child import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
+from fleet.supervisor.log_files import MAX_RUN_DIRECTORIES, Log, new_run, runs_directory
 from fleet.supervisor.spec import FleetSpec
 from fleet.supervisor.start_report import (
     LINK_OPEN_TIMEOUT_S,

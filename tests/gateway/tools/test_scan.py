@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
 
-from gateway.link.serial_ports import by_id, described
+from gateway.link.serial_port_list import by_id, described
 from tests.gateway.conftest import PATIENCE_S, Command, Started
 from tests.support.processes import TcpCar, driving, wait_for
 from tests.support.text_parts import has_parts

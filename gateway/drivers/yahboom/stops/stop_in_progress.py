@@ -1,7 +1,4 @@
-"""Chooses the stop for the state of a car (`StopContext`), computes its worst case, and tracks a stop in progress.
-
-The worst case is the longest time until the motors are off. `sequences` has the frames.
-"""
+"""Tracks a stop in progress: the frames of its tries, and the time to wait for evidence. Pure: time is an argument."""
 
 from typing import Final
 
@@ -9,21 +6,17 @@ from msgspec import Struct, field
 
 from gateway.control.command_log import Pending
 from gateway.drivers.yahboom.estimate.learned import Learned
-from gateway.drivers.yahboom.pacing import FLIGHT_S, Gate, Pacing
-from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, ModeClose
-from gateway.drivers.yahboom.protocol.modes import MODES
-from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
-from gateway.drivers.yahboom.protocol.timing import FRAME_S, RECOVERY_SILENCE_S, REPEAT_INTERVAL_S
+from gateway.drivers.yahboom.pacing import FLIGHT_S, Pacing
+from gateway.drivers.yahboom.protocol.frames import Frame, ModeClose
+from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.timing import RECOVERY_SILENCE_S, REPEAT_INTERVAL_S
 from gateway.drivers.yahboom.stops import cases, sequences
 from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.drivers.yahboom.stops.sequences import StopSequence
+from gateway.drivers.yahboom.stops.stop_choice import AVOIDING_TURN_S, WIRE_S
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S
-from schemas.words import FrameOrigin, Mode, Platform
+from schemas.words import FrameOrigin
 
-WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
-RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory the maximum, except in obstacle avoidance
-_AVOIDING_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
-"""Longest turn of obstacle avoidance. A car in an unknown state may be in this mode, whose turns are the longest."""
 EVIDENCE_TIMEOUT_S: Final = 12.0
 """Timeout for the evidence of a stop, in addition to its announced worst case. After that the command fails."""
 EVIDENCE_INTERVALS: Final = 5
@@ -44,20 +37,6 @@ REPORT_MARGIN_S: Final = 0.1
 """Margin of the wait for a report after the last frame of a try."""
 HELD_UP_S: Final = REPEAT_INTERVAL_S
 """Maximum time for which a stream of actions holds up the next frame of a stop that is being repeated."""
-IN_TIME_S: Final = 0.2
-"""Minimum time between writing a frame and the end of a block, so that the frame arrives before the end on any link."""
-
-
-def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:
-    """Return the kind of stop for a car.
-
-    With `doubted`, its readings contradict its platform. With `open_mode`, they show a mode other than 0. A named frame
-    ends the program of some cars (docs/reference/protocol.md#programs-that-people-have). So it is sent only if the
-    platform or the readings of the car show that the car understands it.
-    """
-    if profile.stop_style is StopStyle.GENERAL:
-        return StopStyle.BOTH if open_mode else StopStyle.GENERAL
-    return StopStyle.BOTH if doubted else profile.stop_style
 
 
 def evidence_s(profile: Profile, learned: Learned) -> float:
@@ -74,46 +53,6 @@ def report_wait_s(profile: Profile, learned: Learned, *, slowest: bool = False) 
     # If there is no echo, the car ranges before it reads the frame, is blocked, and ranges again before it reports.
     interval_s = learned.interval_s(SLOWEST_S if slowest else profile.interval_s)
     return 2 * profile.ranging_s + learned.close_s(profile.close_s) + interval_s + REPORT_MARGIN_S
-
-
-class StopContext(Struct, frozen=True):
-    """The state of the car that decides which stop it needs."""
-
-    profile: Profile
-    known: bool
-    """True if recovery is complete and no write has failed since."""
-    mode: Mode | None
-    """The last commanded mode."""
-    contradicted: bool
-    clear: bool
-    """True if the car has read all our frames before the first frame of the stop is written."""
-    blocked: bool = False
-    """True if our last frame is blocking the car in mode 0. The car does not range directly after such a block."""
-    doubted: bool = False
-    """True if readings contradict the platform, so the car needs a stop that works on any platform."""
-    open_mode: bool = False
-    """True if readings show a mode other than 0."""
-    clearing: ColorLed | None = None
-    """The last color, if the car may hold a string that only a color frame clears."""
-
-    @property
-    def style(self) -> StopStyle:
-        """Return the kind of stop."""
-        return style_of(self.profile, doubted=self.doubted, open_mode=self.open_mode)
-
-    @property
-    def manual(self) -> bool:
-        """Return True if mode 0 was commanded last and is not contradicted."""
-        return self.mode is Mode.MANUAL and not self.contradicted
-
-    @property
-    def turn_s(self) -> float:
-        """Return how many seconds one turn of the mode's loop takes at most. The car reads nothing during a turn.
-
-        If the mode is not known, assume the slowest mode.
-        """
-        known = self.mode is not None and not self.contradicted
-        return self.profile.mode_turn_s(self.mode if known and self.mode is not None else Mode.OBSTACLE_AVOIDANCE)
 
 
 class StopInProgress(Struct):
@@ -242,7 +181,7 @@ class StopInProgress(Struct):
         worst_at = self.worst_at + (0.0 if self.frames_sent else max(0.0, now - self.due))
         if self.sequence.is_recovery and self.frames_sent:
             # The car may have read all frames as one string, and so misread them. Then only the next try stops it.
-            worst_at = max(worst_at, self.next_try_at + _AVOIDING_S)
+            worst_at = max(worst_at, self.next_try_at + AVOIDING_TURN_S)
         return max(worst_at - now, 0.0) + WIRE_S
 
     def over_at(self, pacing: Pacing, now: float) -> float:
@@ -274,71 +213,3 @@ class StopInProgress(Struct):
     def begin_try(self, sequence: StopSequence, now: float) -> None:
         """Begin the next try."""
         self.sequence, self.index, self.try_at = sequence, 0, now
-
-
-def recovery(context: StopContext) -> StopSequence:
-    """Return the stop that brings a car in an unknown state to rest in mode 0."""
-    match context.style:
-        case StopStyle.GENERAL:
-            return sequences.GENERAL
-        case StopStyle.BOTH:
-            return sequences.BOTH
-        case StopStyle.MODE_FRAME | StopStyle.TIMER:
-            return sequences.RECOVERY if context.clearing is None else sequences.clearing(context.clearing)
-
-
-def full(context: StopContext) -> StopSequence:
-    """Return the stop that `stop`, `estop` and a shutdown send."""
-    style = context.style
-    if not context.known or style is StopStyle.GENERAL:
-        return recovery(context)
-    if style is StopStyle.BOTH:
-        return sequences.BOTH_MANUAL if context.manual else sequences.BOTH
-    if not context.manual:
-        return sequences.FULL_MODE
-    if style is StopStyle.TIMER:
-        return sequences.GENERAL  # `MODE00` would show nothing, and turn the LED off
-    return sequences.FULL if context.clear else sequences.FULL_BEHIND
-
-
-def soft(context: StopContext) -> StopSequence:
-    """Return the stop that ends a drive."""
-    if context.style is StopStyle.GENERAL:
-        return sequences.GENERAL_SOFT
-    if context.known and context.manual and context.style is not StopStyle.BOTH:
-        return sequences.SOFT
-    return full(context)
-
-
-def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: float) -> float:
-    """Return the longest time until the motors are off for good, s, for a sequence that begins now."""
-    # Add the waits before a frame, the rest of the running block, and the time on the wire
-    # (docs/reference/protocol.md#stops). If an unread frame of ours may spoil the first frames, also add the wait until
-    # a frame is alone in the buffer.
-    flight_s = max(pacing.ready_at(Gate.FLIGHT) - now, 0.0)
-    block_s = max(pacing.block_until - now, 0.0)
-    ranging_s = FRAME_S if context.blocked else context.profile.mode_turn_s(Mode.MANUAL)
-    lost_s = 0.0 if context.clear else REPEAT_INTERVAL_S
-    if sequence in (sequences.FULL, sequences.FULL_MODE):
-        alone_s = max(pacing.buffer_until - now, 0.0)
-        if not context.manual and now + alone_s + IN_TIME_S < pacing.earliest_block_end:
-            return block_s + WIRE_S  # the car reads `MODE00` when the mode has opened, before the mode's first turn
-        if not context.manual:
-            return max(alone_s, block_s) + context.turn_s + WIRE_S
-        return max(alone_s + ranging_s, block_s + FRAME_S) + WIRE_S
-    if sequence.is_recovery and context.style is StopStyle.TIMER:
-        return sequence.steps[1].after_s + FRAME_S + WIRE_S  # nothing blocks this car
-    if sequence.is_recovery:
-        return RECOVERY_WORST_S + _AVOIDING_S
-    if sequence is sequences.BOTH:
-        # Even if the first frames merge with a partial frame and open a mode, the second half of the sequence closes
-        # it.
-        return RECOVERY_SILENCE_S + _AVOIDING_S + WIRE_S
-    if sequence is sequences.GENERAL and not context.known and context.profile.kind is not Platform.RASPBERRY_PI:
-        lost_s = REPEAT_INTERVAL_S  # the first two frames are lost if the car has half a frame in its buffer
-        return flight_s + FRAME_S + lost_s + ranging_s + WIRE_S
-    begins_with_one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.clear and context.known)
-    second_s = 0.0 if begins_with_one else FRAME_S  # of two frames, the car may read only the second
-    if context.clear:
-        return max(flight_s + second_s + ranging_s, block_s + FRAME_S) + WIRE_S
-    return max(flight_s + second_s + lost_s, block_s) + ranging_s + WIRE_S

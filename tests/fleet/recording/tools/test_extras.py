@@ -9,7 +9,7 @@ from mcap.writer import IndexType
 
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
-from fleet.recording.tools.transform import cut, recover
+from fleet.recording.tools.merge_cut_recover import cut, recover
 from tests.support.random_session import RANGE, START_NS, Mixed
 
 ABOUT = {"robot": "ann", "ROS_DISTRO": "jazzy"}

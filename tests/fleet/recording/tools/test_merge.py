@@ -13,7 +13,7 @@ from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import EVERYTHING
-from fleet.recording.tools.transform import Exists, cut, merge
+from fleet.recording.tools.merge_cut_recover import Exists, cut, merge
 from tests.fleet.replay.make_session import make
 
 

@@ -18,7 +18,7 @@ from mcap.writer import Writer
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_scan import MAGIC
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.tools.transform import recover
+from fleet.recording.tools.merge_cut_recover import recover
 from fleet.recording.tools.verify import verify
 from schemas.local_time import of_iso
 from tests.fleet.recording.damaged import Original, written

@@ -16,7 +16,7 @@ from gateway.drivers.yahboom.executor import FREE_ACTIONS
 from gateway.drivers.yahboom.pacing import Gate, Pacing
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
-from gateway.drivers.yahboom.stops import cases, sequences, stop_in_progress
+from gateway.drivers.yahboom.stops import cases, sequences, stop_choice
 from gateway.sim.model.raspberry_pi import Transport
 from gateway.sim.model.world import World
 from schemas.commands import Verb
@@ -208,10 +208,10 @@ def test_mode_never_opens_while_motors_are_on() -> None:
 FLAGS = (True, False)
 
 
-def situations() -> list[stop_in_progress.StopContext]:
+def situations() -> list[stop_choice.StopContext]:
     """Return all combinations of the inputs of the choice."""
     return [
-        stop_in_progress.StopContext(
+        stop_choice.StopContext(
             parse_platform(platform), known, mode, contradicted, clear, blocked, doubted=doubted, open_mode=open_mode
         )
         for platform, known, mode, contradicted, clear, blocked, doubted, open_mode in product(
@@ -220,23 +220,23 @@ def situations() -> list[stop_in_progress.StopContext]:
     ]
 
 
-def certain(situation: stop_in_progress.StopContext) -> bool:
+def certain(situation: stop_choice.StopContext) -> bool:
     """Return True if the car is known to be in mode 0, where it obeys general frames."""
     return situation.known and situation.mode is Mode.MANUAL and not situation.contradicted
 
 
-def knows_modes(situation: stop_in_progress.StopContext) -> bool:
+def knows_modes(situation: stop_choice.StopContext) -> bool:
     """Return True if the car may get a named frame: its platform knows it, or its readings show an open mode."""
     return situation.open_mode or situation.profile.kind in (Platform.ARDUINO, Platform.STM32)
 
 
-def is_doubtful(situation: stop_in_progress.StopContext) -> bool:
+def is_doubtful(situation: stop_choice.StopContext) -> bool:
     """Return True if the car gets both kinds of stops."""
     return situation.doubted or situation.profile.kind in (Platform.RASPBERRY_PI, Platform.UNKNOWN)
 
 
 # The first matching row counts (docs/reference/protocol.md#stops).
-FULL: tuple[tuple[Callable[[stop_in_progress.StopContext], bool], sequences.StopSequence], ...] = (
+FULL: tuple[tuple[Callable[[stop_choice.StopContext], bool], sequences.StopSequence], ...] = (
     (lambda it: not knows_modes(it), sequences.GENERAL),
     (lambda it: is_doubtful(it) and not it.known, sequences.BOTH),
     (lambda it: is_doubtful(it) and certain(it), sequences.BOTH_MANUAL),
@@ -254,22 +254,22 @@ def test_stop_case_over_whole_input_product() -> None:
     assert len(everything) == 4 * 2 * 8 * 2 * 2 * 2 * 2 * 2
     for situation in everything:
         full = next(recipe for fits, recipe in FULL if fits(situation))
-        assert stop_in_progress.full(situation) is full, situation
+        assert stop_choice.full(situation) is full, situation
         if not knows_modes(situation):
             soft = sequences.GENERAL_SOFT
         else:
             soft = sequences.SOFT if certain(situation) and not is_doubtful(situation) else full
-        assert stop_in_progress.soft(situation) is soft, situation
-        assert stop_in_progress.recovery(situation).rank <= max(full.rank, sequences.RECOVERY.rank)
+        assert stop_choice.soft(situation) is soft, situation
+        assert stop_choice.recovery(situation).rank <= max(full.rank, sequences.RECOVERY.rank)
 
 
 def test_stop_recipes_send_known_frames_only() -> None:
     for situation in situations():
         profile = parse_platform("arduino") if situation.open_mode else situation.profile
         for recipe in (
-            stop_in_progress.full(situation),
-            stop_in_progress.soft(situation),
-            stop_in_progress.recovery(situation),
+            stop_choice.full(situation),
+            stop_choice.soft(situation),
+            stop_choice.recovery(situation),
         ):
             for step in recipe.steps:
                 assert profile.refusal(step.frame) is None, (situation, recipe)
@@ -278,7 +278,7 @@ def test_stop_recipes_send_known_frames_only() -> None:
 def test_stop_recipes_end_alone_in_buffer() -> None:
     """The last frame comes 1.1 s after the frame before it, or waits until the car has read that frame."""
     for situation in situations():
-        for recipe in (stop_in_progress.full(situation), stop_in_progress.soft(situation)):
+        for recipe in (stop_choice.full(situation), stop_choice.soft(situation)):
             last = recipe.steps[-1]
             assert last.after_s >= REPEAT_INTERVAL_S - 1e-9 or last.gate is Gate.ALONE, recipe
 
@@ -289,9 +289,9 @@ def test_announced_time_is_never_less_than_waited() -> None:
             pacing = Pacing(each.profile, Learned())
             pacing.on_written(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
             situation = replace(each, clear=pacing.is_clear(100.0), blocked=False)
-            for recipe in (stop_in_progress.full(situation), stop_in_progress.soft(situation)):
-                worst_s = stop_in_progress.worst_s(recipe, situation, pacing, 100.0)
-                assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop_in_progress.WIRE_S
+            for recipe in (stop_choice.full(situation), stop_choice.soft(situation)):
+                worst_s = stop_choice.worst_s(recipe, situation, pacing, 100.0)
+                assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop_choice.WIRE_S
                 sure = situation.known and not (situation.contradicted or situation.doubted)
                 possible = sure and situation.mode in situation.profile.modes
                 assert worst_s <= LONGEST_S or situation.turn_s > 1.0 or not possible, (situation, recipe)

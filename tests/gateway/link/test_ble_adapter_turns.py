@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gateway.link import CannotOpen, Link, LinkUrl, open_link
-from gateway.link.ble_adapters import Turn, list_connections
+from gateway.link.ble_adapter_turns import Turn, list_connections
 from schemas.bluetooth import ADAPTER_CONNECTIONS
 from schemas.links import BleUrl
 from schemas.process.file_lock import FileLock
