@@ -17,7 +17,7 @@ from fleet.coordinator.inbox import Inbox, Item, QueriedSample
 from fleet.coordinator.observer import FleetObserver
 from fleet.coordinator.open_commands import OpenCommands
 from fleet.coordinator.other_coordinators import declare_alone, yield_to_another
-from fleet.coordinator.plan_commands import PLAN_VERB, bad_value, plan_command, rejected, reply_result, sender_of
+from fleet.coordinator.plan_query_parser import PLAN_VERB, bad_value, plan_command, rejected, reply_result, sender_of
 from fleet.coordinator.plan_state_file import CoordinatorStateFile
 from fleet.coordinator.publications import Publications, assignment_message, decision_message, in_force
 from fleet.policy.decide import step

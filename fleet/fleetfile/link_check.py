@@ -20,6 +20,7 @@ from fleet.fleetfile.fleet_file import FleetCar
 from gateway import drivers
 from schemas.links import UsbUrl
 from schemas.process import port_users
+from schemas.process.port_permission import permission_hint
 from schemas.process.usb_bus import CH340, explain_missing_port
 from schemas.words import LinkState
 
@@ -94,8 +95,7 @@ def check_device(path: str) -> tuple[bool, str]:
     if not stat.S_ISCHR(file_stat.st_mode):
         return False, "is not a serial port but a file or directory"
     if not os.access(path, os.R_OK | os.W_OK):
-        group = _group_name(file_stat.st_gid)
-        return False, f"no permission: join the group {group} (sudo usermod -aG {group} $USER), then log in again"
+        return False, f"no permission. {permission_hint(path)}"
     holder = port_users.find_holder(file_stat)
     if holder is not None:
         return False, f"in use by {holder}. Stop that program first."
@@ -103,17 +103,6 @@ def check_device(path: str) -> tuple[bool, str]:
     users = ", ".join(port_users.find_users(path))
     shared = f", but {users} has it open and may take its bytes: stop that" if users else ""
     return True, f"there, permitted, {free}{shared}; not opened, because that can reset a car"
-
-
-def _group_name(number: int) -> str:
-    try:
-        import grp
-    except ImportError:  # not POSIX
-        return str(number)
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
 
 
 def _list_ports() -> "list[ListPortInfo]":

@@ -1,7 +1,7 @@
 """Byte streams to a car: serial, TCP, Bluetooth LE. `gateway.drivers` gives the bytes their meaning.
 
-`base` has the interfaces, `link_errors` the exceptions. `serial`, `tcp` and `ble` implement the interfaces; `tcp` and
-`ble` use the buffer of `buffered_link`. `ble_adapter_turns` lets several gateways take turns at one Bluetooth adapter.
+`base` has the interfaces, which `serial`, `tcp` and `ble` implement, `link_exceptions` the exceptions. `tcp` and `ble`
+use the buffer of `buffered_link`. `ble_adapter_turns` lets several gateways take turns at one Bluetooth adapter.
 `usb` finds the port of a USB device, `serial_port_list` and `ble_devices` list ports and devices, `url` parses a link
 of the command line. `baud` finds out whether the baud rate may be wrong.
 
@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any
 
 from gateway.link.base import Device, Link, LinkKind
-from gateway.link.link_errors import BadUrl, Busy, CannotList, CannotOpen, LinkError, LinkLost
+from gateway.link.link_exceptions import BadUrl, Busy, CannotList, CannotOpen, LinkError, LinkLost
 from gateway.link.url import parse_url
 from schemas.links import LinkUrl
 

@@ -25,7 +25,7 @@ from gateway.link.base import Device, Link, LinkKind
 from gateway.link.ble_adapter_turns import ConnectionNote, Turn
 from gateway.link.ble_devices import list_devices
 from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
-from gateway.link.link_errors import Busy, CannotOpen, LinkLost
+from gateway.link.link_exceptions import Busy, CannotOpen, LinkLost
 from schemas.bluetooth import ADAPTER_CONNECTIONS, SMALL_ADAPTER_CONNECTIONS, describe_full
 from schemas.links import AUTO_ADAPTER, BleUrl
 from schemas.process.stdio import printable

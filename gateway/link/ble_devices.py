@@ -13,7 +13,7 @@ from bleak.backends.scanner import AdvertisementData
 
 from gateway.link import ble_adapter_turns
 from gateway.link.base import Device
-from gateway.link.link_errors import CannotList
+from gateway.link.link_exceptions import CannotList
 from schemas.links import BleUrl
 from schemas.process.stdio import printable
 

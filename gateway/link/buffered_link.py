@@ -5,7 +5,7 @@ import asyncio
 from typing import Final
 
 from gateway.link.base import Link
-from gateway.link.link_errors import LinkLost
+from gateway.link.link_exceptions import LinkLost
 
 # Over a minute of a car's 960 bytes/s.
 MAX_BUFFERED_BYTES: Final = 64 * 1024

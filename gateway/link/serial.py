@@ -19,11 +19,12 @@ from typing import Final
 import serial
 
 from gateway.link.base import CLOSE_S, Link, LinkKind
-from gateway.link.link_errors import Busy, CannotOpen, LinkLost
+from gateway.link.link_exceptions import Busy, CannotOpen, LinkLost
 from gateway.link.serial_port_list import SerialPort, serial_ports
 from gateway.link.usb import ListedPort, check_same_device, choose, list_serial_ports, port_at
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process import port_users
+from schemas.process.port_permission import permission_hint
 from schemas.process.usb_bus import explain_missing_port
 
 SERIAL_WRITE_TIMEOUT_S: Final = 0.25
@@ -379,7 +380,7 @@ def why_not_open(url: SerialUrl | UsbUrl, path: str, error: Exception) -> str:
         windows = " (COM... is a name on Windows)" if is_windows_name else ""
         return f"{which}no such port on this computer{windows}. {_list_ports_text()}"
     if code in (errno.EACCES, errno.EPERM):
-        return f"{which}no permission. {_permission_hint(path)}"
+        return f"{which}no permission. {permission_hint(path)}"
     if code in _BUSY:
         return f"{which}in use by {_find_holder(path)}. Stop that program first."
     if code == errno.EISDIR or os.path.isdir(path):  # noqa: PTH112 - a device path, not a file to work with
@@ -449,14 +450,3 @@ def _list_ports_text() -> str:
     if missing := explain_missing_port():
         return missing
     return f"Found: {', '.join(found)}. `fleet scan` checks them." if found else "No serial port is plugged in."
-
-
-def _permission_hint(path: str) -> str:
-    """Return a sentence about how to get permission for the port."""
-    try:
-        import grp
-
-        group = grp.getgrgid(os.stat(path).st_gid).gr_name  # noqa: PTH116 - a device path, not a file to work with
-    except (ImportError, OSError, KeyError):
-        return "Ask the administrator for access to the port."
-    return f"It belongs to group {group}: `sudo usermod -aG {group} $USER`, then log in again"

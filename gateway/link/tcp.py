@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from gateway.link.base import CLOSE_S, Link, LinkKind
 from gateway.link.buffered_link import MAX_BUFFERED_BYTES, BufferedLink
-from gateway.link.link_errors import CannotOpen, LinkLost
+from gateway.link.link_exceptions import CannotOpen, LinkLost
 from schemas.links import TcpUrl
 
 # A vanished peer is noticed within about five seconds, where the system has these options.

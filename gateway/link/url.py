@@ -1,6 +1,6 @@
 """Accepts the URL of a link from the command line."""
 
-from gateway.link.link_errors import BadUrl
+from gateway.link.link_exceptions import BadUrl
 from schemas.links import BadLink, LinkUrl, parse_link
 
 

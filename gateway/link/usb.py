@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from gateway.link.link_errors import CannotOpen
+from gateway.link.link_exceptions import CannotOpen
 from schemas.links import SerialUrl, UsbUrl
 from schemas.process.stdio import printable
 from schemas.process.usb_bus import CH340, explain_missing_port

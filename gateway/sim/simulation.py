@@ -15,7 +15,7 @@ from gateway.sim.faults import Fault, FaultKind, Press, targets
 from gateway.sim.model.capture_car import CaptureCar
 from gateway.sim.model.factory import build, build_ugv
 from gateway.sim.model.faulty_link import Direction, FaultyLink
-from gateway.sim.model.firmware import Firmware, Pose, Truth
+from gateway.sim.model.firmware_base import Firmware, Pose, Truth
 from gateway.sim.model.ir_remote import Button
 from gateway.sim.model.raspberry_pi import PI_BOOT_S, RaspberryPiCar, Transport
 from gateway.sim.model.ugv import UGV_BUILDS, UgvCar

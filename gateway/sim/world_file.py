@@ -9,7 +9,7 @@ from math import radians
 
 from msgspec import Struct
 
-from gateway.sim.model.firmware import Pose
+from gateway.sim.model.firmware_base import Pose
 from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import World
 from schemas.geometry import Point, Segment, loop

@@ -15,7 +15,7 @@ from typing import Final
 import zenoh
 
 from schemas import keys
-from schemas.bus.certificate_keeper import RENEWAL_QUERY_TIMEOUT_S, renew_file
+from schemas.bus.certificate_renewer import RENEWAL_QUERY_TIMEOUT_S, renew_file
 from schemas.bus.credentials import HUB, Credentials
 from schemas.bus.endpoint import is_secure
 from schemas.bus.replies import BUSY

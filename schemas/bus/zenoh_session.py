@@ -149,7 +149,7 @@ class Bus:
     def _with_keeper(self) -> Self:
         """Start to renew the certificate of this session, if it has one."""
         if self.identity:
-            from schemas.bus.certificate_keeper import CertificateKeeper
+            from schemas.bus.certificate_renewer import CertificateKeeper
 
             own, me = credentials_of(self.endpoint), self.identity
             keeper = CertificateKeeper(own, me, ask=self._ask_hub, reopen=self.reopen, closing=self._closing)

@@ -44,19 +44,19 @@ def stages(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Co
 def test_map_shapes_floors_and_box(stage: ConsoleStage) -> None:
     page = stage.page()
     red, blue = [0, 0, 0, "", None, None], [5, 1, 0, "map", 0.1, 4]
-    places = {car: call(page, "map-shapes", "placeOf", each) for car, each in {"red": red, "blue": blue}.items()}
+    places = {car: call(page, "map-geometry", "placeOf", each) for car, each in {"red": red, "blue": blue}.items()}
     assert (places["red"]["isTrue"], places["blue"]["isTrue"], places["blue"]["age_s"]) == (True, False, 4)
-    assert call(page, "map-shapes", "floorsOf", places) == ["", "map"]
-    box = call(page, "map-shapes", "boxOf", [[0, 0], [5, 1]], None)
+    assert call(page, "map-geometry", "floorsOf", places) == ["", "map"]
+    box = call(page, "map-geometry", "boxOf", [[0, 0], [5, 1]], None)
     assert box == [-0.5, -1, 5.5, 2], "a margin, steps of half a meter, and at least two meters"
-    assert call(page, "map-shapes", "boxOf", [[1, 0]], box) == box, "it stands still while a car drives"
-    assert call(page, "map-shapes", "boxOf", [[9, 0]], box)[2] == 9.5
-    assert call(page, "map-shapes", "pointsOf", None, places, {"blue": [[1, 2, 3]]}, "map") == [[5, 1], [2, 3]]
+    assert call(page, "map-geometry", "boxOf", [[1, 0]], box) == box, "it stands still while a car drives"
+    assert call(page, "map-geometry", "boxOf", [[9, 0]], box)[2] == 9.5
+    assert call(page, "map-geometry", "pointsOf", None, places, {"blue": [[1, 2, 3]]}, "map") == [[5, 1], [2, 3]]
     before = {"red": [[1, 0, 0], [40_000, 1, 1]], "green": [[1, 0, 0]]}
     new = {"whole": False, "trails": {"red": [[41_000, 2, 2]]}}
-    assert call(page, "map-shapes", "grown", before, new, 50_000) == {"red": [[40_000, 1, 1], [41_000, 2, 2]]}
-    assert call(page, "map-shapes", "grown", before, new | {"whole": True}, 50_000) == {"red": [[41_000, 2, 2]]}
-    assert [call(page, "map-shapes", "degrees", yaw) for yaw in (0, -1.5708, 7)] == [0, 270, 41]
+    assert call(page, "map-geometry", "grown", before, new, 50_000) == {"red": [[40_000, 1, 1], [41_000, 2, 2]]}
+    assert call(page, "map-geometry", "grown", before, new | {"whole": True}, 50_000) == {"red": [[41_000, 2, 2]]}
+    assert [call(page, "map-geometry", "degrees", yaw) for yaw in (0, -1.5708, 7)] == [0, 270, 41]
 
 
 def where(page: Page, car: str) -> tuple[float, float]:

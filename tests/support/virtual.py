@@ -13,7 +13,7 @@ from gateway.control.driver import TICK_S
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.factory import build
-from gateway.sim.model.firmware import Firmware
+from gateway.sim.model.firmware_base import Firmware
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World

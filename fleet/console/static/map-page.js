@@ -2,7 +2,7 @@
 
 import { driverOf, isLost, modeWords, motionWords, troublesOf } from "./car-words.js";
 import { carsInPlace, clock, consoleNow, on, store, unwish, who, wish } from "./console.js";
-import { boxOf, degrees, floorsOf, grown, placeOf, pointsOf } from "./map-shapes.js";
+import { boxOf, degrees, floorsOf, grown, placeOf, pointsOf } from "./map-geometry.js";
 import { useMoments } from "./moments.js";
 import { need } from "./past.js";
 import { t } from "./texts.js";

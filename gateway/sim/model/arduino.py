@@ -10,7 +10,7 @@ from collections.abc import Generator
 from math import inf
 from typing import Final
 
-from gateway.sim.model.firmware import COLOR_S, WHISTLE_S, Program, Wait, motion
+from gateway.sim.model.firmware_base import COLOR_S, WHISTLE_S, Program, Wait, motion
 from gateway.sim.model.mode_car import ARDUINO_LIGHTS, MODE_OF_DIGIT, ModeCar, to_int
 from schemas.words import Mode
 

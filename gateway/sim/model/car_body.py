@@ -3,7 +3,7 @@
 from math import atan2, ceil, cos, degrees, hypot, pi, radians, sin
 from typing import Final
 
-from gateway.sim.model.firmware import Pose, Rng
+from gateway.sim.model.firmware_base import Pose, Rng
 from gateway.sim.model.world import STEP_S, World
 from schemas.geometry import Point
 

@@ -7,7 +7,7 @@ besides the motions, are assumptions.
 from math import inf
 from typing import Final
 
-from gateway.sim.model.firmware import BYTES_PER_S, CarBodyState, Firmware, Program, Rng, Wait, motion
+from gateway.sim.model.firmware_base import BYTES_PER_S, CarBodyState, Firmware, Program, Rng, Wait, motion
 from gateway.sim.model.raspberry_pi import PI_BOOT_S, PI_LIGHTS, SOCKET_BUFFER, TTY_BUFFER, Transport
 from gateway.sim.model.traits import CarTraits
 

@@ -3,7 +3,7 @@
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
 from gateway.sim.model.course import CourseCar
-from gateway.sim.model.firmware import Firmware, Rng
+from gateway.sim.model.firmware_base import Firmware, Rng
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.stm32 import Stm32Car
 from gateway.sim.model.traits import CarTraits

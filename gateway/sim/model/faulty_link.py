@@ -1,6 +1,6 @@
 """A link with faults on virtual time: it delays, drops, changes or blocks bytes in either direction.
 
-Without faults it passes bytes on unchanged. `endpoints` opens and closes links; `firmware` models the UART's rate.
+Without faults it passes bytes on unchanged. `endpoints` opens and closes links; `firmware_base` models the UART's rate.
 """
 
 from collections import deque
@@ -8,7 +8,7 @@ from enum import StrEnum
 from math import inf
 from typing import Final, Protocol
 
-from gateway.sim.model.firmware import BYTES_PER_S
+from gateway.sim.model.firmware_base import BYTES_PER_S
 
 TO_HOST_LIMIT: Final = 1024
 """Maximum number of bytes in a slow link to the host. Further bytes are lost, as in a Bluetooth module."""

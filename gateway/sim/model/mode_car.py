@@ -8,7 +8,7 @@ from collections.abc import Generator
 from math import inf
 from typing import ClassVar, Final
 
-from gateway.sim.model.firmware import (
+from gateway.sim.model.firmware_base import (
     COLOR_S,
     NO_ECHO_S,
     WHISTLE_S,

@@ -11,7 +11,7 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from gateway.sim.model.firmware import Pose
+from gateway.sim.model.firmware_base import Pose
 from schemas.geometry import (
     Hit,
     Point,

@@ -5,7 +5,7 @@ from enum import StrEnum
 from math import inf
 from typing import Final
 
-from gateway.sim.model.firmware import (
+from gateway.sim.model.firmware_base import (
     BYTES_PER_S,
     COLOR_S,
     WHISTLE_S,

@@ -7,7 +7,7 @@ speeds of the modes here are those of the Arduino program.
 
 from typing import ClassVar, Final
 
-from gateway.sim.model.firmware import Program, Wait, motion
+from gateway.sim.model.firmware_base import Program, Wait, motion
 from gateway.sim.model.mode_car import MODE_OF_DIGIT, ModeCar, to_int
 from gateway.sim.model.traits import CarTraits
 from schemas.words import Mode

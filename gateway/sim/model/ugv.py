@@ -19,7 +19,7 @@ from typing import Any, Final
 from msgspec import Struct
 
 from gateway.sim.model.car_body import TOP_SPEED_M_S, CarBody
-from gateway.sim.model.firmware import Pose, Rng, Truth
+from gateway.sim.model.firmware_base import Pose, Rng, Truth
 from gateway.sim.model.ir_remote import SIGNS, Button
 from gateway.sim.model.scheduler import EventScheduler
 from schemas.words import Mode

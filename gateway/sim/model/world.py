@@ -12,7 +12,7 @@ from typing import Final, Protocol
 
 from msgspec.structs import replace
 
-from gateway.sim.model.firmware import Pose
+from gateway.sim.model.firmware_base import Pose
 from gateway.sim.model.objects import Lamp, MovingObject, carried
 from gateway.sim.model.scheduler import EventScheduler
 from schemas.geometry import (

@@ -10,7 +10,7 @@ import serial
 
 from gateway.sim.car_spec import parse_cars
 from gateway.sim.model.factory import build
-from gateway.sim.model.firmware import Firmware, Truth
+from gateway.sim.model.firmware_base import Firmware, Truth
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
 from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World

@@ -24,7 +24,7 @@ from gateway.sim.endpoints import EndpointError, Taken
 from gateway.sim.faults import Fault, FaultKind
 from gateway.sim.model.car_body import CUT_OFF_V
 from gateway.sim.model.faulty_link import Direction
-from gateway.sim.model.firmware import Firmware
+from gateway.sim.model.firmware_base import Firmware
 from gateway.sim.simulation import Simulation
 from gateway.sim.truth_publisher import HUB_RETRY_DELAY_S, TruthPublisher
 from schemas.bus import Bus, Sample

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fleet.examples import EXAMPLES
 from gateway.sim.model.car_body import CarBody
-from gateway.sim.model.firmware import Pose
+from gateway.sim.model.firmware_base import Pose
 from gateway.sim.model.objects import FAR_M, FASTEST_M_S, Lamp, MovingObject
 from gateway.sim.model.world import World
 from gateway.sim.world_file import WorldSpec, read_world

@@ -9,7 +9,7 @@ import pytest
 
 from gateway.sim.model.arduino import ArduinoCar
 from gateway.sim.model.car_body import CarBody
-from gateway.sim.model.firmware import CarBodyState, Pose, Truth
+from gateway.sim.model.firmware_base import CarBodyState, Pose, Truth
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import RaspberryPiCar
 from gateway.sim.model.stm32 import STM32_TRAITS

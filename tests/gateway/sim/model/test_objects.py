@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from gateway.sim.model.car_body import SONAR_REACH_CM, CarBody
 from gateway.sim.model.factory import build
-from gateway.sim.model.firmware import Firmware, Pose
+from gateway.sim.model.firmware_base import Firmware, Pose
 from gateway.sim.model.objects import Lamp, MovingObject
 from gateway.sim.model.world import World
 from schemas.geometry import RADIUS_M, box, distance

@@ -6,7 +6,7 @@ from math import cos, hypot, pi, radians, sin
 import pytest
 
 from gateway.sim.model.car_body import CarBody
-from gateway.sim.model.firmware import Pose
+from gateway.sim.model.firmware_base import Pose
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.world import World
 from schemas.geometry import RADIUS_M
