@@ -91,6 +91,8 @@ class PendingCommand:
         self._named = named
         self._read_link = read_link
         self._link_then = read_link()
+        self._link_when_gone: dict[str, str] = {}
+        """Our link to the hub when a gateway was lost, by car."""
         self.is_taken: Future[bool] = Future()
         """True as soon as a gateway has answered, or no outcome is awaited any more. False if the bus was lost or the
         Fleet was closed before a gateway answered."""
@@ -138,8 +140,12 @@ class PendingCommand:
             if now >= waits_at:
                 self._say_waits(waiting)
             for progress in waiting:
-                if now >= progress.deadline and not progress.awaits_bus and self._read_link() != self._link_then:
-                    progress.on_presence(now, alive=True)  # its gateway is not gone: our hub was lost
+                if progress.is_awaited and now >= progress.deadline and not progress.awaits_bus:
+                    link = self._read_link()
+                    if link != self._link_when_gone.get(progress.car, self._link_then):
+                        # Its gateway may still be there: our own link was lost. Excuse the gateway only once for it.
+                        self._link_when_gone[progress.car] = link
+                        progress.on_presence(now, alive=True)
                 if now >= progress.deadline and self.inbox.empty():  # after a stall, its answer may be in the queue
                     progress.give_up(now)
             due = [each.deadline for each in waiting] or [now + ANSWER_TIMEOUT_S]
@@ -245,8 +251,10 @@ class PendingCommand:
     def _on_presence(self, change: PresenceChange, at: float) -> None:
         if change.alive:
             self._present.add(change.car)
+            self._link_when_gone.pop(change.car, None)
         else:
             self._present.discard(change.car)
+            self._link_when_gone.setdefault(change.car, self._read_link())
         progress = self._progress.get(change.car)
         if progress is None:
             if change.alive and self.lost_bus and self._named is None:

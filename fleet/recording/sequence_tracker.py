@@ -4,7 +4,6 @@ The recorder uses `SequenceTracker` to request backfills, `sessions verify` uses
 """
 
 from collections.abc import Hashable
-from math import inf
 from typing import Final
 
 from msgspec import Struct, field
@@ -64,7 +63,11 @@ class TrackedSender(Struct):
     gaps: list[Gap] = field(default_factory=list)
     """Gaps that a backfill may still close."""
     earlier_gaps: list[Gap] = field(default_factory=list)
-    """Gaps of the session before this one. Its writer shares this list, and may still fill them by a backfill."""
+    """Gaps of the sessions before this one. If their messages come, they go to this session."""
+
+    def fill(self, number: int) -> bool:
+        """Remove a number from the gap that contains it. Return False if no gap does."""
+        return _fill(self.gaps, number) or _fill(self.earlier_gaps, number)
 
 
 class SequenceTracker:
@@ -85,14 +88,13 @@ class SequenceTracker:
         """Return the tracker of the session that follows this one without a pause.
 
         It notices a gap between the two sessions, and takes no message that this one has. The gaps of this one are
-        missing only here.
+        missing only here, but if their messages come, the next session takes them.
         """
         tracker = SequenceTracker()
         tracker._early = self._early
-        tracker.senders = {
-            name: TrackedSender(sender.last, sender.first, sender.heard_ns, earlier_gaps=sender.gaps)
-            for name, sender in self.senders.items()
-        }
+        for name, sender in self.senders.items():
+            earlier = [*sender.earlier_gaps, *sender.gaps][-MAX_OPEN_GAPS:]
+            tracker.senders[name] = TrackedSender(sender.last, sender.first, sender.heard_ns, earlier_gaps=earlier)
         return tracker
 
     @property
@@ -114,8 +116,7 @@ class SequenceTracker:
         if self._early.get((sender, number)) == published_ns:
             del self._early[sender, number]
             return False
-        # If it fills a gap, a newer backfilled message came before it.
-        if _fill(known.gaps, number) or _fill(known.earlier_gaps, number):
+        if known.fill(number):  # a newer backfilled message came before it
             return True
         self._restart(known, number)  # the sender restarted its count, so this is not a gap of four billion messages
         return True
@@ -134,7 +135,7 @@ class SequenceTracker:
     def is_missing(self, sender: Hashable, number: int) -> bool:
         """Return True if this number of a sender is in a gap that a backfill may close."""
         known = self.senders.get(sender)
-        return known is not None and any(number in gap for gap in known.gaps)
+        return known is not None and any(number in gap for gap in (*known.gaps, *known.earlier_gaps))
 
     def add_backfilled(self, sender: Hashable, number: int, published_ns: int) -> bool:
         """Add a backfilled message. Return False if it is a duplicate."""
@@ -149,7 +150,7 @@ class SequenceTracker:
         elif 0 < (before := (known.first - number) % _MODULO) < _BACKWARD:
             self._skip(known, number, before)
             known.first = number
-        elif not _fill(known.gaps, number):
+        elif not known.fill(number):
             return False
         return True
 
@@ -163,9 +164,7 @@ class SequenceTracker:
     def _begin(self, sender: Hashable, number: int) -> TrackedSender:
         """Add a sender. Messages before its first number precede this recording, and are not a gap."""
         if len(self.senders) >= MAX_TRACKED_SOURCES:
-            # Forget the sender that has been silent for the longest time. A sender that was only backfilled lives: its
-            # cache has just answered.
-            oldest = min(self.senders, key=lambda each: self.senders[each].heard_ns or inf)
+            oldest = min(self.senders, key=lambda each: self.senders[each].heard_ns)  # silent for the longest time
             self._lost += sum(gap.count for gap in self.senders.pop(oldest).gaps)
         self.senders[sender] = known = TrackedSender(number, number)
         return known

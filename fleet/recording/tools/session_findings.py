@@ -89,6 +89,9 @@ class SessionCheckup(Struct):
             worst = max(verdict.missing, key=lambda gap: gap["count"])
             words = f"{verdict.missing_count} messages are missing, most at once of {worst['key']} ({worst['count']})."
             yield DoctorFinding("gaps", words, verify)
+        elif missed := sum(verdict.missed.values()):
+            words = f"{missed} messages never came, most of {max(verdict.missed, key=verdict.missed.__getitem__)}."
+            yield DoctorFinding("gaps", words, verify)
         if cars := _most(self.broken):
             yield DoctorFinding("link_breaks", f"Links broke: {cars}.", replay)
         if reasons := _most(self.refused):

@@ -27,6 +27,9 @@ BACKFILL_POLL_INTERVAL_S: Final = 0.2
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
 """Number of polls in 2 s. This is Zenoh's lease: only a silence of this time shows that a link is lost, so messages may
 be missing since its beginning. Counted in polls, so that a stall of this process makes the window longer."""
+ANSWER_TIMEOUT_S: Final = 5.0
+"""Timeout for the answers to one query. A publisher on a bad network takes seconds."""
+MIN_ANSWER_TIMEOUT_S: Final = 0.1
 MAX_CLOSE_S: Final = 15.0
 """Maximum time for the last queries. `fleet up` waits 30 s for a recorder that ends."""
 MAX_ANSWERS: Final = 200_000
@@ -44,7 +47,8 @@ class Backfill:
         """Keys with the time from which messages are missing, s, monotonic."""
         self._answers: list[zenoh.Sample] = []
         self._closing = threading.Event()
-        self._max_close_s = MAX_CLOSE_S
+        self._until = inf
+        """When the thread ends at the latest."""
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
         self._plan = BackfillPlan(now, resume_since=now - RESUME_WINDOW_S if resumes else None)
@@ -59,8 +63,8 @@ class Backfill:
         self._thread.join()
 
     def end(self, within_s: float) -> None:
-        """Let the thread ask one last time, and end. `within_s`: maximum time after which a last query begins."""
-        self._max_close_s = min(within_s, self._max_close_s)
+        """Let the thread ask one last time, and end within this time. A query that is under way may take longer."""
+        self._until = min(time.monotonic() + within_s, self._until)
         self._closing.set()
 
     @property
@@ -102,36 +106,41 @@ class Backfill:
                 self._ask(self._plan.due_queries(now))
             polls.append(now)
             waiting_since = time.monotonic()
-        now = time.monotonic()
-        self._plan.add_gaps(self._take_gaps(), polls[0], now)
-        self._ask(self._plan.last_queries(), until=now + self._max_close_s)
+        while (now := time.monotonic()) < self._until:
+            self._plan.add_gaps(self._take_gaps(), polls[0], now)
+            self._ask(self._plan.last_queries(), is_last=True)
+            if not self._gaps:
+                break
 
     def _take_gaps(self) -> dict[str, float]:
         with self._lock:
             gaps, self._gaps = self._gaps, {}
         return gaps
 
-    def _ask(self, queries: Iterable[PlannedQuery], until: float = inf) -> None:
-        """Send these queries. Leave the rest to the last ones if the recording ends, and stop at `until`."""
+    def _ask(self, queries: Iterable[PlannedQuery], *, is_last: bool = False) -> None:
+        """Send these queries. If the recording ends, leave the rest to the last ones, and those when time is up."""
         for query in queries:
             answered: set[str] = set()
             is_whole = True
             for expression in self._all if query.source == EVERYTHING else (f"{query.source}/**",):
-                if time.monotonic() > until or (until == inf and self._closing.is_set()):
+                if time.monotonic() >= self._until or (self._closing.is_set() and not is_last):
                     return
-                is_whole &= self._recall(expression, query.since, answered)
+                is_whole &= self._recall(expression, query.since, answered, is_last=is_last)
             if is_whole:
                 self._plan.add_answers(query, answered)
 
-    def _recall(self, expression: str, since: float, answered: set[str]) -> bool:
-        """Fetch the messages, and add their keys to `answered`. Return False if there was no room for all of them."""
+    def _recall(self, expression: str, since: float, answered: set[str], *, is_last: bool) -> bool:
+        """Fetch the messages, and add their keys to `answered`. Return False if this was cut short."""
         found: list[zenoh.Sample] = []
         is_whole, own = True, self._bus.id
         # Compute the window anew for each expression: on a bad network, the answers for one take seconds, and the
         # window of the next one would be too short.
-        for sample in self._bus.recall(expression, time.monotonic() - since):
+        now = time.monotonic()
+        timeout_s = min(ANSWER_TIMEOUT_S, max(self._until - now, MIN_ANSWER_TIMEOUT_S))
+        for sample in self._bus.recall(expression, now - since, timeout_s=timeout_s):
             found.append(sample)
-            if len(found) + len(self._answers) > MAX_ANSWERS:
+            has_room = len(found) + len(self._answers) <= MAX_ANSWERS
+            if not has_room or (self._closing.is_set() and not is_last):  # the last queries ask for the rest
                 is_whole = False
                 break
         with self._lock:

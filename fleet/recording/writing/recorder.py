@@ -60,9 +60,9 @@ both waits are repeated."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
-MAX_GAP_WAIT_S: Final = 8.0
-"""Maximum time for which a session that is over waits for the messages in its gaps. A last query may take 5 s more, and
-clients wait 15 s for the answer to `stop`."""
+MAX_STOP_S: Final = 8.0
+"""Maximum time for which a session that is to be closed waits for its missing messages. Before it, the people may have
+to be asked for (STATUS_TIMEOUT_S), and clients wait 15 s for the answer."""
 
 
 class RecordingFailed(Exception):
@@ -141,9 +141,6 @@ class Recorder:
         self._subscribers: list[SampleChannel] = []
         self._error = ""
         self._recording = True
-        self._earlier: SessionWriter | None = None
-        """The session before this one, while it waits for the messages in its gaps."""
-        self._earlier_until = 0.0
         self.ended = threading.Event()
         """Set when the writer has closed the session or failed."""
 
@@ -285,7 +282,6 @@ class Recorder:
             if self._reader_error is not None:
                 self._fail(f"{type(self._reader_error).__name__}: {self._reader_error}")
                 return
-            self._end_earlier()
             if self._recording:
                 self._end_session(self._session)
             self._publish(RecorderState.CLOSED)
@@ -345,9 +341,7 @@ class Recorder:
     def _add_backfilled(self, samples: Sequence[zenoh.Sample]) -> None:
         late: list[tuple[int, str, str, bytes]] = []
         for sample in samples:
-            now_ns, key = self._now(), str(sample.key_expr)
-            fills_earlier = self._earlier is not None and self._earlier.fill_gap(sample, now_ns)
-            new = fills_earlier or self._session.add_backfilled(sample, now_ns)
+            new, key = self._session.add_backfilled(sample, self._now()), str(sample.key_expr)
             if new and sample.timestamp is not None and self._pin_watch.is_watched(key):
                 published_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
                 late.append((published_ns, key, str(sample.encoding), sample.payload.to_bytes()))
@@ -359,12 +353,9 @@ class Recorder:
         session = self._session
         if self._recording:
             session.tick(self._now())
-            if session.over and not session.full:
+            if session.over and not session.full and not self._stops:
                 self._begin_session(after=session)
-                self._end_earlier()
-                self._earlier, self._earlier_until = session, time.monotonic() + MAX_GAP_WAIT_S
-            if self._earlier and (not self._earlier.can_be_filled or time.monotonic() >= self._earlier_until):
-                self._end_earlier()
+                self._end_session(session)
         self._report_news(self._session)
         self._publish()
 
@@ -378,12 +369,6 @@ class Recorder:
         """Close a session, and report its last news."""
         session.close(self._now())
         self._report_news(session)
-
-    def _end_earlier(self) -> None:
-        """Close the session before this one, if it still waits for messages."""
-        if self._earlier is not None:
-            earlier, self._earlier = self._earlier, None
-            self._end_session(earlier)
 
     def _report_news(self, session: SessionWriter) -> None:
         """Report removals by the quota, failed copies, and each new state once."""
@@ -417,8 +402,6 @@ class Recorder:
             self._session.messages,
         )
         self._last.drops.update(self._session.drops)
-        with contextlib.suppress(OSError):  # the error of this session is the one to report
-            self._end_earlier()
         with contextlib.suppress(zenoh.ZError):  # the bus may be the cause; `close` and session.json report the failure
             self._service.publish(self._last, self._now())
 
@@ -539,7 +522,7 @@ class Recorder:
         """Ask for missing messages one last time. The session records until the answers have come."""
         if not self._recording:
             raise _CommandRefused(f"Nothing is being recorded. The last session is {self._session.path}.")
-        self._backfill.end(MAX_GAP_WAIT_S)
+        self._backfill.end(MAX_STOP_S)
 
     def _finish_stop(self) -> None:
         """Close the session if a stop was requested, and the last answers have come. Answer the request."""
@@ -547,7 +530,6 @@ class Recorder:
             return
         if self._recording and not self.ended.is_set():
             self._drain()
-            self._end_earlier()
             self._end_session(self._session)
             self._recording = False
             losses = f"; {self._session.cost}" if self._session.cost else ""

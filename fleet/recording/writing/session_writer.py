@@ -175,30 +175,19 @@ class SessionWriter:
         state = self._states.get(key)
         if state is None or state.encoding != sample.encoding:
             state = self._key_state(key, sample.encoding)
-        missing = state.tracker.missing
+        was_missing = state.tracker.is_missing(sender, sequence)
         if (
             not state.tracker.add_backfilled(sender, sequence, published_ns)
             or (key, sequence, published_ns) in self._recorded
         ):
             return False
         self._irregular_keys.add(key)
-        if state.tracker.missing < missing:
+        known = state.tracker.senders[sender]
+        known.heard_ns = known.heard_ns or received_ns
+        if was_missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
         self._write((state, received_ns, sample.payload.to_bytes(), published_ns, sequence))
         return True
-
-    @property
-    def can_be_filled(self) -> bool:
-        """True if messages are missing that `fill_gap` can still write."""
-        return self._segment is not None and not self.full and bool(self.missed)
-
-    def fill_gap(self, sample: zenoh.Sample, received_ns: int) -> bool:
-        """Write a backfilled publication if it is missing. Return False if it is not, or belongs to no gap."""
-        tracker, source = self._trackers.get(str(sample.key_expr)), sample.source_info
-        if tracker is None or source is None:
-            return False
-        sender = (source.source_id.zid, source.source_id.eid)
-        return tracker.is_missing(sender, sequence_of(source)) and self.add_backfilled(sample, received_ns)
 
     def _end_point(self) -> resume.ResumePoint:
         """Return where the session begins that follows this one."""

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import pytest
 
-from fleet.client import command_tracker
-from fleet.client.command_tracker import PendingCommand, QueryEnded
+from fleet.client import command_tracker, outcome
+from fleet.client.command_tracker import PendingCommand, PresenceChange, QueryEnded
 from fleet.client.commands import mode_request, resume_request
 from fleet.client.outcome import Progress, Until
 from fleet.client.outcome_words import EFFECTS, STOP_VERBS
@@ -14,6 +14,7 @@ from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S, MAX_QUEUE_TIME_S
 from tests.support.message_length import MAX_LINES, count_lines
+from tests.support.text_parts import has_parts
 
 # Each step: ("answer" | "event", phase, worst case), at 1, 2, 3 ... s after the request at 100.
 Steps = list[tuple[str, str, float]]
@@ -232,6 +233,21 @@ def test_waiting_command_is_explained_once(monkeypatch: pytest.MonkeyPatch, capl
     pending.inbox.put((time.monotonic(), QueryEnded("red", "")))
     pending.wait()
     assert [record.getMessage() for record in caplog.records] == ["red: opens later"]
+
+
+def test_gateway_that_is_gone_is_not_excused_by_an_earlier_loss_of_our_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outcome, "GATEWAY_RETURN_TIMEOUT_S", 0.05)
+    links = iter(["first", *["second"] * 1000])
+    pending = PendingCommand("it", mode_request("tracking"), ["red"], ["red"], lambda: next(links), lambda car: None)
+    for item in (
+        pb.CommandEvent(car="red", phase="queued"),
+        PresenceChange("red", alive=False),
+        QueryEnded("red", ""),
+    ):
+        pending.inbox.put((time.monotonic(), item))
+    pending.wait()
+    (found,) = pending.outcomes()
+    assert (found.ok, has_parts(found.words, "its gateway is gone")) == (False, True)
 
 
 def test_car_that_was_not_asked_has_no_outcome() -> None:

@@ -27,6 +27,7 @@ def event(**fields: Any) -> pb.CommandEvent:
         ("not_closed", [], {"closed": False, "ended": "the recorder did not close it"}),
         ("recorder_drops", [], {"dropped": {"fleet/red/sensor/line": 4}}),
         ("gaps", [], {"missing": [{"key": "fleet/red/sensor/line", "count": 3}]}),
+        ("gaps", [], {"missed": {"fleet/red/sensor/line": 3}}),
         ("link_breaks", [log("link_lost"), log("link_lost")], {}),
         ("refused", [event(verb="drive", phase="rejected", reason="held")], {}),
         ("not_shown", [event(verb="stop", phase="failed", reason="not_shown")], {}),

@@ -247,7 +247,7 @@ def test_messages_that_are_lost_between_two_sessions_are_backfilled(endpoint: st
     assert (first, sorted(second)) == ([1], [2, 3, 4])
 
 
-def test_session_that_is_over_waits_for_its_missed_messages(
+def test_missed_messages_of_a_full_session_go_to_the_next_one(
     endpoint: str, bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fleet.recording.writing.backfill.BACKFILL_POLL_INTERVAL_S", 60.0)  # asks only at the end
@@ -267,10 +267,12 @@ def test_session_that_is_over_waits_for_its_missed_messages(
         wait_for(lambda: len(list(tmp_path.iterdir())) == 2, "the next session")
         ranges.put(pb.Range(range_m=4.0), time.time_ns())
         heard(car._session)
-        recorder.close()
-    assert recorded_numbers(tmp_path, ranges.key) == [[1, 3, 2], [4]]
-    description = json.loads((first / "session.json").read_text())
-    assert (description["closed"], description["missed"], description["recovered"]) == (True, {}, {ranges.key: 1})
+        outcome = recorder.close()
+    assert outcome.missed == {}
+    assert recorded_numbers(tmp_path, ranges.key) == [[1, 3], [4, 2]]
+    descriptions = [json.loads((each / "session.json").read_text()) for each in (first, outcome.session)]
+    assert [each["closed"] for each in descriptions] == [True, True]
+    assert descriptions[0]["missed"] == descriptions[1]["recovered"] == {ranges.key: 1}
 
 
 @pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])
