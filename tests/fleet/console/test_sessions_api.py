@@ -1,8 +1,10 @@
 """The routes of the sessions page without a browser. They serve recordings, and no path leads out of the folder."""
 
+import contextlib
 import http.client
 import io
 import json
+import select
 import time
 import zipfile
 from collections.abc import Iterator
@@ -118,6 +120,8 @@ def test_past_api_answers_without_path_escape(fleet: FleetProcesses, tmp_path: P
 
 REQUESTS = 40
 """Requests that one person sends at once."""
+ROUNDS = 4
+"""Maximum number of tries."""
 MAX_SLOWER = 6.0
 """Ratio of times: a process beside those of others, at 2 at a time, and what a busy machine adds. All 40 need 20."""
 
@@ -148,16 +152,23 @@ def test_many_requests_of_one_person_keep_no_other_request_waiting(
         assert json.loads(answer(console.port, "GET", "/sessions")[1])["sessions"]
         return time.monotonic() - since
 
-    alone_s = max(list_time(), list_time())
-    connections = [send_request(console.port, verb, flooded, **own) for _ in range(REQUESTS)]
-    if not kept:
-        for each in connections:
-            each.close()
-    assert list_time() < MAX_SLOWER * alone_s
-    if not kept:  # its own next request does not wait for them, either
-        since = time.monotonic()
-        assert answer(console.port, verb, flooded, "", **own)[0] == 200
-        assert time.monotonic() - since < MAX_SLOWER * alone_s
-    for each in connections:
-        each.close()
+    def waits() -> bool:
+        """Return True if another request took longer than beside those of others."""
+        alone_s = max(list_time(), list_time())
+        with contextlib.ExitStack() as connections:
+            requests = [send_request(console.port, verb, flooded, **own) for _ in range(REQUESTS)]
+            for each in requests:
+                connections.callback(each.close)
+            select.select([each.sock for each in requests], [], [], PATIENCE_S)  # the others wait or are at work now
+            if not kept:
+                connections.close()
+            flooded_s = list_time()
+            if not kept:  # its own next request does not wait for them, either
+                since = time.monotonic()
+                assert answer(console.port, verb, flooded, "", **own)[0] == 200
+                flooded_s = max(flooded_s, time.monotonic() - since)
+        return flooded_s >= MAX_SLOWER * alone_s
+
+    # A stalled machine is as slow as a request that waits, but not each time.
+    assert not all(waits() for _ in range(ROUNDS))
     assert console.process.end() == 0
