@@ -118,6 +118,11 @@ class SequenceTracker:
             return False
         if known.fill(number):  # a newer backfilled message came before it
             return True
+        before = (known.first - number) % _MODULO
+        if 0 < before < _BACKWARD and (sender, known.first) in self._early:  # all that is known of it was backfilled
+            self._skip(known, number, before)
+            known.first = number
+            return True
         self._restart(known, number)  # the sender restarted its count, so this is not a gap of four billion messages
         return True
 
@@ -152,6 +157,8 @@ class SequenceTracker:
             known.first = number
         elif not known.fill(number):
             return False
+        elif (sender, known.last) in self._early:  # the original of a newer one has not arrived, so this one's may
+            self._expect(sender, number, published_ns)
         return True
 
     def _expect(self, sender: Hashable, number: int, published_ns: int) -> None:

@@ -32,6 +32,9 @@ QUERY_TIMEOUT_S: Final = 5.0
 MIN_QUERY_TIMEOUT_S: Final = 0.1
 MAX_CLOSE_S: Final = 15.0
 """Maximum time for the last queries. `fleet up` waits 30 s for a recorder that ends."""
+LAST_ROUNDS: Final = 2
+"""Maximum number of last queries to one source. On a network that loses messages all the time, each is followed by new
+gaps."""
 MAX_ANSWERS: Final = 200_000
 """Maximum number of answers in the queue to the writer. The rest stays a gap, and is requested again."""
 
@@ -106,10 +109,10 @@ class Backfill:
                 self._ask(self._plan.due_queries(now))
             polls.append(now)
             waiting_since = time.monotonic()
-        while (now := time.monotonic()) < self._until:
-            self._plan.add_gaps(self._take_gaps(), polls[0], now)
+        for _ in range(LAST_ROUNDS):
+            self._plan.add_gaps(self._take_gaps(), polls[0], time.monotonic())
             self._ask(self._plan.last_queries(), is_last=True)
-            if not self._gaps:
+            if not self._gaps:  # none was noticed meanwhile
                 break
 
     def _take_gaps(self) -> dict[str, float]:

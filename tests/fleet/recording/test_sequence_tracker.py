@@ -56,6 +56,23 @@ def test_backfilled_message_is_not_written_again_when_it_arrives() -> None:
     assert numbers.missing == 0
 
 
+def test_gap_among_backfilled_messages_is_not_written_again_when_it_arrives() -> None:
+    numbers = SequenceTracker()
+    live(numbers, 1)
+    assert all(numbers.add_backfilled("a", number, number * 10) for number in (2, 4, 3))
+    assert live(numbers, 2, 3, 4, 5) == [False, False, False, True]
+    assert live(numbers, 7) == [True]
+    assert numbers.add_backfilled("a", 6, 60)
+    assert numbers._early == {}, "its original can arrive no more"
+
+
+def test_message_before_backfilled_ones_is_no_restart() -> None:
+    numbers = SequenceTracker()
+    assert all(numbers.add_backfilled("a", number, number * 10) for number in (4, 5))
+    assert live(numbers, 2, 3, 4, 5, 6) == [True, True, False, False, True]
+    assert (numbers.missing, numbers.senders["a"].last) == (0, 6)
+
+
 def test_message_behind_recalled_ones_starts_no_stream() -> None:
     numbers = SequenceTracker()
     live(numbers, 1)
