@@ -28,6 +28,7 @@ from fleet.console.pairing import (
     PairedDevice,
     PeopleBook,
     TooManyGuesses,
+    WrongCode,
     code_words,
     new_code,
 )
@@ -178,11 +179,11 @@ class Lan:
 
     async def pair(
         self, code: str, client: tuple[str, int], device: str, cookie_before: str = ""
-    ) -> tuple[str | None, float, PagePerson | None]:
-        """Pair a device. Return its cookie, or None and the time to wait before the next try (s).
+    ) -> tuple[str, PagePerson]:
+        """Pair a device. Return its cookie and its person.
 
         cookie_before: the cookie that the device has already, if any. If the code is that of a class, a paired device
-        keeps its person. Raises ClassFull, and TooManyGuesses while the address has to wait.
+        keeps its person. Raises ClassFull, WrongCode, and TooManyGuesses while the address has to wait.
         """
         now, address = time.monotonic(), client[0]
         if (wait_s := self.guesses.wait_s(address, now)) > 0:
@@ -191,7 +192,7 @@ class Lan:
         book = self.people.read()
         known, state = book.device_of(cookie_before, time.time())
         if known is not None and state == "valid" and book.is_class_code(code, time.time()):
-            return cookie_before, 0.0, known.person
+            return cookie_before, known.person
         cookie = secrets.token_urlsafe(32)
         found = book.redeem(code, cookie, "", device, time.time())
         if found is not None:
@@ -199,12 +200,12 @@ class Lan:
         if found is None:
             count = self.guesses.on_wrong(address, now)
             log.warning("%s typed a wrong pairing code (%d from there, %d in all)", address, count, self.guesses.wrong)
-            return None, self.guesses.wait_s(address, now), None
+            raise WrongCode(self.guesses.wait_s(address, now))
         self.guesses.on_right(address)
         paired = found.devices[-1]
         log.warning("%s paired as %s, %s (%s)", address, paired.person.name, paired.person.rank, paired.id)
         self.listener.on_paired(client, paired.id)
-        return cookie, 0.0, paired.person
+        return cookie, paired.person
 
     @staticmethod
     def _redeemed(book: PeopleBook, code: str, cookie: str, device: str) -> tuple[PeopleBook, PeopleBook | None]:

@@ -62,12 +62,16 @@ class ClassFull(Exception):
     """There is no place for another guest. The message says what to do."""
 
 
-class TooManyGuesses(Exception):
-    """Too many wrong codes came from an address, so it has to wait. `wait_s`: how long, s."""
+class WrongCode(Exception):
+    """A code is wrong, used or too old. `wait_s`: how long its address has to wait before the next try, s."""
 
     def __init__(self, wait_s: float) -> None:
         super().__init__(f"wait {wait_s:.0f} s")
         self.wait_s = wait_s
+
+
+class TooManyGuesses(WrongCode):
+    """The address has to wait after wrong codes. The code was not looked at, so it may be right."""
 
 
 class NoGuest(ValueError):

@@ -9,7 +9,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from fleet.console.page_requests import BadPageMessage, PageMessage
-from fleet.console.pairing import ClassFull, PagePerson, TooManyGuesses
+from fleet.console.pairing import ClassFull, PagePerson, TooManyGuesses, WrongCode
 from fleet.console.request_body import read_text
 from fleet.console.request_filter import PAIR_PATH, PERSON, Scope
 from schemas.words import Rank
@@ -35,19 +35,17 @@ def pair_routes(lan: "Lan") -> list[Route]:
         device = request.headers.get("user-agent", "")[:_MAX_DEVICE_LENGTH]
         before = request.cookies.get(lan.cookie, "")
         try:
-            cookie, wait_s, person = await lan.pair(code, (request.client.host, request.client.port), device, before)
+            cookie, person = await lan.pair(code, (request.client.host, request.client.port), device, before)
         except ClassFull as error:
             return _failure(str(error), 409)
-        except TooManyGuesses as error:  # the code was not looked at, so it may be right
+        except WrongCode as error:
             wait = str(math.ceil(error.wait_s))
-            words = f"Too many wrong codes came from this device's address. Try again in {wait} s."
+            words = f"This code is wrong, used or too old. Wait {wait} s before the next try."
+            if isinstance(error, TooManyGuesses):
+                words = f"Too many wrong codes came from this device's address. Try again in {wait} s."
+            elif error.wait_s == 0:
+                return _failure("This code is wrong, used or too old.", 403)
             return _failure(words, 429, {"retry-after": wait})
-        if cookie is None or person is None:
-            words = "This code is wrong, used or too old."
-            if wait_s == 0:
-                return _failure(words, 403)
-            wait = str(math.ceil(wait_s))
-            return _failure(f"{words} Wait {wait} s before the next try.", 429, {"retry-after": wait})
         return JSONResponse({"ok": True, "name": person.name}, headers={"set-cookie": lan.set_cookie(cookie)})
 
     return [Route(PAIR_PATH, page), Route(PAIR_PATH, pair, methods=["POST"])]

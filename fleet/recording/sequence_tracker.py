@@ -59,7 +59,7 @@ class TrackedSender(Struct):
     """The newest number."""
     first: int
     heard_ns: int = 0
-    """When the newest message was received, ns. 0 if none was."""
+    """When the newest message was received, ns. If only answers came, when the first of them did. 0 if none did."""
     gaps: list[Gap] = field(default_factory=list)
     """Gaps that a backfill may still close."""
     earlier_gaps: list[Gap] = field(default_factory=list)
@@ -118,10 +118,7 @@ class SequenceTracker:
             return False
         if known.fill(number):  # a newer backfilled message came before it
             return True
-        before = (known.first - number) % _MODULO
-        if 0 < before < _BACKWARD and (sender, known.first) in self._early:  # all that is known of it was backfilled
-            self._skip(known, number, before)
-            known.first = number
+        if (sender, known.first) in self._early and self._precede(known, number):  # only answers have come before it
             return True
         self._restart(known, number)  # the sender restarted its count, so this is not a gap of four billion messages
         return True
@@ -152,9 +149,8 @@ class SequenceTracker:
             self._skip(known, known.last, ahead)
             known.last = number
             self._expect(sender, number, published_ns)
-        elif 0 < (before := (known.first - number) % _MODULO) < _BACKWARD:
-            self._skip(known, number, before)
-            known.first = number
+        elif self._precede(known, number):
+            pass
         elif not known.fill(number):
             return False
         elif (sender, known.last) in self._early:  # the original of a newer one has not arrived, so this one's may
@@ -175,6 +171,15 @@ class SequenceTracker:
             self._lost += sum(gap.count for gap in self.senders.pop(oldest).gaps)
         self.senders[sender] = known = TrackedSender(number, number)
         return known
+
+    def _precede(self, known: TrackedSender, number: int) -> bool:
+        """Add a message before the first one, with the gap between them. Return False if it is not before it."""
+        before = (known.first - number) % _MODULO
+        if not 0 < before < _BACKWARD:
+            return False
+        self._skip(known, number, before)
+        known.first = number
+        return True
 
     def _restart(self, known: TrackedSender, number: int) -> None:
         self._lost += sum(gap.count for gap in known.gaps)

@@ -1,4 +1,4 @@
-"""What a start says: when it has ended, which cars are ready or missing, and old stops still in force. Pure."""
+"""Describes a start: its end, the cars that are ready or missing, and old stops that are still in force. Pure."""
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC

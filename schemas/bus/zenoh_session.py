@@ -59,6 +59,8 @@ sites know the second one, too. Then the first one is kept for the same time aga
 way."""
 ANSWERS_S: Final = 12.0
 """Time for which the first session stays open for late answers. No query waits for longer than 10 s."""
+RECALL_TIMEOUT_S: Final = 5.0
+"""Timeout for what publishers have cached. A publisher on a bad network takes seconds."""
 REOPEN_TIMEOUT_S: Final = 5.0
 TOKENS_OF_NOBODY: Final = "*/@hub"
 """A key for a query that is only a barrier. No such token exists, but everyone may ask for it: when the hub answers, it
@@ -476,7 +478,7 @@ class Bus:
             elif reply.err is not None:
                 yield Failure(reply.err.payload.to_string())
 
-    def recall(self, expression: str, last_s: float, *, timeout_s: float = 5.0) -> Iterator[zenoh.Sample]:
+    def recall(self, expression: str, last_s: float, *, timeout_s: float = RECALL_TIMEOUT_S) -> Iterator[zenoh.Sample]:
         """Return publications of the last seconds from the caches of running publishers (`Publisher`).
 
         These publications have their original time and sequence number. Those of one publisher are in order. Reading

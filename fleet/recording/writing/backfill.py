@@ -22,14 +22,14 @@ from fleet.recording.writing.backfill_plan import EVERYTHING, BackfillPlan, Plan
 from fleet.recording.writing.resume import RESUME_WINDOW_S
 from schemas.bus import Bus
 from schemas.bus.sample import session_of
+from schemas.bus.zenoh_session import RECALL_TIMEOUT_S
 
 BACKFILL_POLL_INTERVAL_S: Final = 0.2
 LEASE_POLLS: Final = round(2.0 / BACKFILL_POLL_INTERVAL_S)
 """Number of polls in 2 s. This is Zenoh's lease: only a silence of this time shows that a link is lost, so messages may
 be missing since its beginning. Counted in polls, so that a stall of this process makes the window longer."""
-QUERY_TIMEOUT_S: Final = 5.0
-"""Timeout for the answers to one query. A publisher on a bad network takes seconds."""
 MIN_QUERY_TIMEOUT_S: Final = 0.1
+"""Minimum timeout of the last query that begins in time."""
 MAX_CLOSE_S: Final = 15.0
 """Maximum time for the last queries. `fleet up` waits 30 s for a recorder that ends."""
 LAST_ROUNDS: Final = 2
@@ -139,7 +139,7 @@ class Backfill:
         # Compute the window anew for each expression: on a bad network, the answers for one take seconds, and the
         # window of the next one would be too short.
         now = time.monotonic()
-        timeout_s = min(QUERY_TIMEOUT_S, max(self._until - now, MIN_QUERY_TIMEOUT_S))
+        timeout_s = min(RECALL_TIMEOUT_S, max(self._until - now, MIN_QUERY_TIMEOUT_S))
         for sample in self._bus.recall(expression, now - since, timeout_s=timeout_s):
             found.append(sample)
             has_room = len(found) + len(self._answers) <= MAX_ANSWERS

@@ -277,7 +277,6 @@ class Recorder:
                     due = max(due + FLUSH_INTERVAL_S, time.monotonic())
                     self._tick()
                 self._answer()
-                self._finish_stop()
             self._drain()
             if self._reader_error is not None:
                 self._fail(f"{type(self._reader_error).__name__}: {self._reader_error}")
@@ -292,7 +291,6 @@ class Recorder:
         finally:
             self.ended.set()
             self._answer()
-            self._finish_stop()
 
     def _drain(self) -> None:
         with self._lock:
@@ -452,6 +450,7 @@ class Recorder:
                     self._stops.append((query, key))
                 else:
                     self._reply(query, key)
+        self._finish_stop()
 
     def _reply(self, query: zenoh.Query, key: str) -> None:
         reply_value(query, key, self._last.SerializeToString(), STATUS_TOPIC)

@@ -85,7 +85,7 @@ class SessionWriter:
         self.uncopied: list[str] = []
         """Files that could not be copied. The recorder reports and clears them."""
         self._trackers: dict[str, SequenceTracker] = {}
-        """What was received of each key, also by the session before."""
+        """The numbers of each key that this session and those before it have received."""
         self._irregular_keys: set[str] = set()
         """Keys whose sequence numbers were not always consecutive."""
         self.gaps: dict[str, int] = {}
@@ -167,15 +167,14 @@ class SessionWriter:
         published_ns = stamp.get_time_as_ntp64().as_nanos()
         key, sequence = str(sample.key_expr), sequence_of(source)
         sender = (source.source_id.zid, source.source_id.eid)
-        if published_ns < self._resume_since_ns:
-            # A message in a gap belongs to this session, even if the publisher's clock is slow.
-            tracker = self._trackers.get(key)
-            if tracker is None or not tracker.is_missing(sender, sequence):
-                return False
+        tracker = self._trackers.get(key)
+        was_missing = tracker is not None and tracker.is_missing(sender, sequence)
+        # A message in a gap belongs to this session, even if the publisher's clock is slow.
+        if published_ns < self._resume_since_ns and not was_missing:
+            return False
         state = self._states.get(key)
         if state is None or state.encoding != sample.encoding:
             state = self._key_state(key, sample.encoding)
-        was_missing = state.tracker.is_missing(sender, sequence)
         if (
             not state.tracker.add_backfilled(sender, sequence, published_ns)
             or (key, sequence, published_ns) in self._recorded

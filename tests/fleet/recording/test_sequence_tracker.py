@@ -141,7 +141,7 @@ def test_sender_that_is_silent_for_longest_is_forgotten_first() -> None:
 
 @given(st.sets(st.integers(1, 60)), st.integers(0, 2**32))
 def test_each_message_is_taken_once_by_the_sessions_of_one_recording(lost: set[int], seed: int) -> None:
-    """What one session lacks goes to the next ones, if it comes."""
+    """If a message comes after the end of the session that lacks it, a later session takes it."""
     chance, taken = random.Random(seed), []
     trackers = [SequenceTracker()]
 

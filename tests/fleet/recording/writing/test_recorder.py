@@ -5,7 +5,9 @@ import os
 import threading
 import time
 from collections import Counter
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from functools import cached_property
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ from fleet.recording.writing.recorder import Recorder
 from fleet.recording.writing.recorder_service import AnotherRecorder
 from fleet.recording.writing.session_writer import Options
 from schemas import keys, messages
-from schemas.bus import Bus, Sample, router_config
+from schemas.bus import Bus, Publisher, Sample, router_config
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from schemas.words import RecorderState, RecorderVerb
@@ -146,45 +148,72 @@ def test_sequence_gaps_are_counted_and_restart_is_none(endpoint: str, bus: Bus, 
     assert json.loads((session / "session.json").read_text())["missed"] == {key: 2}
 
 
+class TappedCar:
+    """A car whose link to the hub can be cut."""
+
+    key = "fleet/red/sensor/range"
+
+    def __init__(self, bus: Bus, tap: Tap) -> None:
+        self.bus = bus
+        self._tap = tap
+
+    @cached_property
+    def _ranges(self) -> Publisher:
+        return publisher(self.bus, "red", "sensor/range")  # waits for the recorder
+
+    def put(self, count: int = 1) -> None:
+        for _ in range(count):
+            self._ranges.put(pb.Range(range_m=1.0), time.time_ns())
+
+    def put_heard(self) -> None:
+        self.put()
+        heard(self.bus._session)
+
+    def cut(self) -> None:
+        self._tap.reset()
+        wait_for(lambda: not self.bus.link, "the car is cut off")
+
+    def mend(self) -> None:
+        self._tap.accept()
+        wait_for(lambda: self.bus.link, "the car is back")
+
+    def lose(self) -> None:
+        """Publish a reading while the link is cut."""
+        self.cut()
+        self.put()
+        self.mend()
+
+
+@contextmanager
+def tapped_car(endpoint: str) -> Iterator[TappedCar]:
+    tap = Tap(endpoint.replace("tcp/", "tcp://"))
+    with closing(tap), Bus.open(tap.link.replace("tcp://", "tcp/")) as bus:
+        yield TappedCar(bus, tap)
+
+
 def test_messages_of_cut_off_car_are_backfilled(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     """The recorder stays connected, so it hears of the gap only after it, with the next message of the car.
 
     A command event shows no gap, because none comes after it.
     """
-    tap = Tap(endpoint.replace("tcp/", "tcp://"))
-    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+    with Bus.open(endpoint) as own, tapped_car(endpoint) as car:
         recorder = Recorder(own, "fleet", tmp_path)
         session = recorder.start()
-        ranges = publisher(car, "red", "sensor/range")
-        ranges.put(pb.Range(range_m=1.0), time.time_ns())
-        events = publisher(car, "red", "event/command")
+        car.put()
+        events = publisher(car.bus, "red", "event/command")
         events.put(pb.CommandEvent(verb="stop"), time.time_ns())
-        heard(car._session)
-        tap.reset()
-        wait_for(lambda: not car.link, "the car is cut off")
-        for _ in range(20):
-            ranges.put(pb.Range(range_m=2.0), time.time_ns())
+        heard(car.bus._session)
+        car.cut()
+        car.put(20)
         events.put(pb.CommandEvent(verb="estop"), time.time_ns())
         time.sleep(2 * LEASE_POLLS * BACKFILL_POLL_INTERVAL_S)  # not a wait: how long it is cut off
-        tap.accept()
-        wait_for(lambda: car.link, "the car is back")
-        ranges.put(pb.Range(range_m=3.0), time.time_ns())
-        heard(car._session)
+        car.mend()
+        car.put_heard()
         outcome = recorder.close()
     assert outcome.missed == {}
     held = Counter(channel.topic for _, channel, _ in stock(session / "0001.mcap"))
     assert held["fleet/red/sensor/range"] == 22
     assert held["fleet/red/event/command"] == 2
-
-
-def cut_off(car: Bus, tap: Tap) -> None:
-    tap.reset()
-    wait_for(lambda: not car.link, "the car is cut off")
-
-
-def back(car: Bus, tap: Tap) -> None:
-    tap.accept()
-    wait_for(lambda: car.link, "the car is back")
 
 
 def recorded_numbers(root: Path, key: str) -> list[list[int]]:
@@ -197,53 +226,40 @@ def recorded_numbers(root: Path, key: str) -> list[list[int]]:
 
 
 def test_stop_waits_for_missed_messages(endpoint: str, bus: Bus, tmp_path: Path) -> None:
-    tap = Tap(endpoint.replace("tcp/", "tcp://"))
-    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+    with Bus.open(endpoint) as own, tapped_car(endpoint) as car:
         recorder = Recorder(own, "fleet", tmp_path)
         recorder.start()
-        ranges = publisher(car, "red", "sensor/range")
-        ranges.put(pb.Range(range_m=1.0), time.time_ns())
-        heard(car._session)
-        cut_off(car, tap)
-        ranges.put(pb.Range(range_m=2.0), time.time_ns())
-        back(car, tap)
-        ranges.put(pb.Range(range_m=3.0), time.time_ns())
-        heard(car._session)
+        car.put_heard()
+        car.lose()
+        car.put_heard()
         found = ask_recorder(bus, "fleet", RecorderVerb.STOP)
         assert found is not None
         assert (found.state, dict(found.missed)) == (RecorderState.STOPPED, {})
-        (first,) = recorded_numbers(tmp_path, ranges.key)
+        (first,) = recorded_numbers(tmp_path, car.key)
         assert sorted(first) == [1, 2, 3]
-        cut_off(car, tap)
-        ranges.put(pb.Range(range_m=4.0), time.time_ns())
-        back(car, tap)
+        car.lose()
         assert ask_recorder(bus, "fleet", RecorderVerb.START) is not None
-        ranges.put(pb.Range(range_m=5.0), time.time_ns())
-        heard(car._session)
+        car.put_heard()
         outcome = recorder.close()
     assert outcome.missed == {}, "nobody recorded between the two sessions"
-    assert recorded_numbers(tmp_path, ranges.key) == [first, [5]]
+    assert recorded_numbers(tmp_path, car.key) == [first, [5]]
 
 
 def test_messages_that_are_lost_between_two_sessions_are_backfilled(endpoint: str, bus: Bus, tmp_path: Path) -> None:
-    tap = Tap(endpoint.replace("tcp/", "tcp://"))
-    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+    with Bus.open(endpoint) as own, tapped_car(endpoint) as car:
         recorder = Recorder(own, "fleet", tmp_path, Options(quota=Quota(session=100_000)))
         recorder.start()
-        ranges = publisher(car, "red", "sensor/range")
-        ranges.put(pb.Range(range_m=1.0), time.time_ns())
-        heard(car._session)
-        cut_off(car, tap)
-        ranges.put(pb.Range(range_m=2.0), time.time_ns())
+        car.put_heard()
+        car.cut()
+        car.put()
         bus.put_command("fleet/blue/@cmd/drive", os.urandom(200_000), "application/json", 1)
         wait_for(lambda: len(list(tmp_path.iterdir())) == 2, "the next session")
-        ranges.put(pb.Range(range_m=3.0), time.time_ns())
-        back(car, tap)
-        ranges.put(pb.Range(range_m=4.0), time.time_ns())
-        heard(car._session)
+        car.put()
+        car.mend()
+        car.put_heard()
         outcome = recorder.close()
     assert outcome.missed == {}
-    first, second = recorded_numbers(tmp_path, ranges.key)
+    first, second = recorded_numbers(tmp_path, car.key)
     assert (first, sorted(second)) == ([1], [2, 3, 4])
 
 
@@ -251,28 +267,22 @@ def test_missed_messages_of_a_full_session_go_to_the_next_one(
     endpoint: str, bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fleet.recording.writing.backfill.BACKFILL_POLL_INTERVAL_S", 60.0)  # asks only at the end
-    tap = Tap(endpoint.replace("tcp/", "tcp://"))
-    with closing(tap), Bus.open(endpoint) as own, Bus.open(tap.link.replace("tcp://", "tcp/")) as car:
+    with Bus.open(endpoint) as own, tapped_car(endpoint) as car:
         recorder = Recorder(own, "fleet", tmp_path, Options(quota=Quota(session=100_000)))
         first = recorder.start()
-        ranges = publisher(car, "red", "sensor/range")
-        ranges.put(pb.Range(range_m=1.0), time.time_ns())
-        heard(car._session)
-        cut_off(car, tap)
-        ranges.put(pb.Range(range_m=2.0), time.time_ns())
-        back(car, tap)
-        ranges.put(pb.Range(range_m=3.0), time.time_ns())
+        car.put_heard()
+        car.lose()
+        car.put()
         wait_for(lambda: recorder._session.missed, "the gap")
         bus.put_command("fleet/blue/@cmd/drive", os.urandom(200_000), "application/json", 1)
         wait_for(lambda: len(list(tmp_path.iterdir())) == 2, "the next session")
-        ranges.put(pb.Range(range_m=4.0), time.time_ns())
-        heard(car._session)
+        car.put_heard()
         outcome = recorder.close()
     assert outcome.missed == {}
-    assert recorded_numbers(tmp_path, ranges.key) == [[1, 3], [4, 2]]
+    assert recorded_numbers(tmp_path, car.key) == [[1, 3], [4, 2]]
     descriptions = [json.loads((each / "session.json").read_text()) for each in (first, outcome.session)]
     assert [each["closed"] for each in descriptions] == [True, True]
-    assert descriptions[0]["missed"] == descriptions[1]["recovered"] == {ranges.key: 1}
+    assert descriptions[0]["missed"] == descriptions[1]["recovered"] == {car.key: 1}
 
 
 @pytest.mark.parametrize("limits", [{"max_messages": 20}, {"max_bytes": 1000}])
