@@ -10,6 +10,7 @@ import socket
 import ssl
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from fleet.console.waiting_room import WaitingRoom
@@ -40,6 +41,8 @@ SHUTDOWN_TIMEOUT_S: Final = 2.0
 # to 3 ms.
 COLLECT_AFTER: Final = 100
 """Number of handshakes after which their garbage is collected: 9 MB at most."""
+SOCKET_RETRY_S: Final = 0.02
+"""Interval at which sockets are tried on Windows, whose loop cannot watch them: the same as `SERVE_INTERVAL_S`."""
 _READ_BYTES: Final = 4096
 _TLS_HELLO: Final = b"\x16"
 """The first byte of a TLS client: a handshake record (RFC 8446, 5.1)."""
@@ -59,24 +62,47 @@ class Entrance:
         self._waiting: dict[Address, socket.socket] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._timers: dict[Callable[[], None], asyncio.TimerHandle] = {}
+        self._polls: dict[int, asyncio.TimerHandle] = {}
+        """The next try of each socket that the loop cannot watch, by its file number."""
         self._begun = 0
         """Number of handshakes since the last collection."""
 
     def open(self) -> None:
         """Begin to accept."""
         self._listener.settimeout(0.0)
-        self._loop.add_reader(self._listener.fileno(), self._accept)
+        self._watch(self._listener, self._accept)
         self._expire()
 
     def close(self) -> None:
         """Accept no more connections, and close those that wait. The caller closes the listener afterwards."""
         for timer in self._timers.values():
             timer.cancel()
-        self._loop.remove_reader(self._listener.fileno())
+        self._unwatch(self._listener)
         for task in self._tasks:
             task.cancel()
         for key in list(self._waiting):
             self._drop(key)
+
+    def _watch(self, watched: socket.socket, call: Callable[[], None]) -> None:
+        """Call a function whenever a socket may be read. The function must not block if there is nothing to read."""
+        try:
+            self._loop.add_reader(watched.fileno(), call)
+        except NotImplementedError:  # the loop of Windows that can start processes
+            self._poll_later(watched.fileno(), call)
+
+    def _poll_later(self, number: int, call: Callable[[], None]) -> None:
+        def poll() -> None:
+            self._poll_later(number, call)
+            call()  # may end the polls
+
+        self._polls[number] = self._loop.call_later(SOCKET_RETRY_S, poll)
+
+    def _unwatch(self, watched: socket.socket) -> None:
+        try:
+            self._loop.remove_reader(watched.fileno())
+        except NotImplementedError:
+            if (poll := self._polls.pop(watched.fileno(), None)) is not None:
+                poll.cancel()
 
     def _after(self, delay_s: float, call: Callable[[], None]) -> None:
         """Call a function once after a delay. Do nothing if a call of it waits already."""
@@ -98,15 +124,15 @@ class Entrance:
                 break
             connection.settimeout(0.0)
             self._waiting[address] = connection
-            self._loop.add_reader(connection.fileno(), self._on_readable, address)
+            self._watch(connection, partial(self._on_readable, address))
             dropped = self._room.add(address, address[0], time.monotonic())
             if isinstance(dropped, tuple):
                 self._drop(dropped)
-        self._loop.remove_reader(self._listener.fileno())
+        self._unwatch(self._listener)
         self._after(ACCEPT_PAUSE_S, self._accept_again)
 
     def _accept_again(self) -> None:
-        self._loop.add_reader(self._listener.fileno(), self._accept)
+        self._watch(self._listener, self._accept)
 
     def _on_readable(self, key: Address) -> None:
         connection = self._waiting[key]
@@ -121,7 +147,7 @@ class Entrance:
                 connection.recv(_READ_BYTES)  # closing a connection with unread bytes would reset it
             self._drop(key)
             return
-        self._loop.remove_reader(connection.fileno())
+        self._unwatch(connection)
         self._room.on_hello(key, key[0])
         self._after(0.0, self._serve_next)
 
@@ -158,7 +184,7 @@ class Entrance:
 
     def _drop(self, key: Address) -> None:
         connection = self._waiting.pop(key)
-        self._loop.remove_reader(connection.fileno())
+        self._unwatch(connection)
         connection.close()
         self._room.remove(key, key[0])
 

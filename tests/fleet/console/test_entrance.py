@@ -41,7 +41,18 @@ def echoed(port: int) -> bytes:
         return secure.recv(1)
 
 
-async def test_silent_connections_and_other_protocols_lock_nobody_out(listener: LimitedListener) -> None:
+def fail_as_on_windows(*_: object) -> None:
+    raise NotImplementedError
+
+
+@pytest.mark.parametrize("can_watch", [True, False])
+async def test_silent_connections_and_other_protocols_lock_nobody_out(
+    listener: LimitedListener, monkeypatch: pytest.MonkeyPatch, can_watch: bool
+) -> None:
+    loop = asyncio.get_running_loop()
+    if not can_watch:  # the handshakes still need the loop of this system
+        monkeypatch.setattr(loop, "add_reader", fail_as_on_windows)
+        monkeypatch.setattr(loop, "remove_reader", fail_as_on_windows)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     ensure_certificate(("127.0.0.1",)).load_into(context)
     entrance = Entrance(listener, context, ByteEcho)
