@@ -20,7 +20,8 @@ from fleet.client.commands import (
     speed_request,
 )
 from fleet.commands.car_names import CarNames, cars_argument
-from fleet.commands.options import carry_out, json_option, take_option, with_client
+from fleet.commands.exit_code import carry_out
+from fleet.commands.options import json_option, take_option, with_client
 from fleet.commands.params import Choice, Color, Duration, describe_usage
 from schemas.commands import COMMANDS, CommandType
 from schemas.suggestion import misspelled

@@ -10,6 +10,7 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.commands.command_group import connect_option
+from fleet.commands.exit_code import cli_errors
 from fleet.commands.fleet_file import (
     confirm,
     file_argument,
@@ -21,7 +22,6 @@ from fleet.commands.fleet_file import (
     read,
     write,
 )
-from fleet.commands.options import cli_errors
 from fleet.fleet_links import may_be_same, parse_fleet_link
 from fleet.fleetfile.editor import CannotEdit, set_link
 from fleet.fleetfile.fleet_file import FleetFile

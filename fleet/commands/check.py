@@ -11,8 +11,9 @@ import click
 import yaml
 from msgspec import to_builtins
 
+from fleet.commands.exit_code import cli_errors
 from fleet.commands.fleet_file import DEFAULT_FILE, print_errors
-from fleet.commands.options import cli_errors, json_option
+from fleet.commands.options import json_option
 from fleet.coordinator.observer import listed_cars
 from fleet.fleet_links import LINK_SIM, parse_fleet_link
 from fleet.fleetfile.adapter_check import check_adapters, list_adapters

@@ -27,7 +27,8 @@ from fleet.commands.command_group import (
     say,
     starter_option,
 )
-from fleet.commands.options import bus_options, cli_errors, json_option
+from fleet.commands.exit_code import cli_errors
+from fleet.commands.options import bus_options, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
 from fleet.console import DEFAULT_PORT

@@ -13,7 +13,8 @@ import click
 from fleet.client.client import default_sender
 from fleet.commands.car_names import car_option
 from fleet.commands.command_group import chosen_person
-from fleet.commands.options import cli_errors, json_option
+from fleet.commands.exit_code import cli_errors
+from fleet.commands.options import json_option
 from fleet.commands.output import MAX_CELL, aligned, echo_csv, echo_safely
 from fleet.commands.params import Duration, existing_sessions_place
 from fleet.console import DEFAULT_PORT

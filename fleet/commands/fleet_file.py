@@ -13,7 +13,7 @@ from typing import Final
 import click
 from msgspec import to_builtins
 
-from fleet.commands.options import cli_errors
+from fleet.commands.exit_code import cli_errors
 from fleet.commands.params import Choice, Duration, Number
 from fleet.fleet_links import LINK_SIM
 from fleet.fleetfile.fleet_file import FleetFile, default_color, parse_fleet, read_fleet

@@ -14,7 +14,8 @@ import segno
 
 from fleet.client.client import Fleet
 from fleet.commands.command_group import CommandGroup
-from fleet.commands.options import cli_errors, json_option
+from fleet.commands.exit_code import cli_errors
+from fleet.commands.options import json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
 from fleet.hub import local_hub

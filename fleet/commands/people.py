@@ -4,7 +4,8 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.commands.car_names import cars_argument, complete_people, resolve_cars
-from fleet.commands.options import end_with, json_option, with_client
+from fleet.commands.exit_code import end_with
+from fleet.commands.options import json_option, with_client
 from fleet.commands.params import Duration
 from schemas.commands import COMMANDS, Verb
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from fleet.commands.options import cli_errors, json_option
+from fleet.commands.exit_code import cli_errors
+from fleet.commands.options import json_option
 from fleet.commands.output import echo_safely
 from fleet.commands.params import Duration, SessionPath, session_argument
 

@@ -11,7 +11,8 @@ import click
 
 from fleet.commands.car_names import car_option
 from fleet.commands.command_group import connect_option
-from fleet.commands.options import cli_errors, from_option, to_option
+from fleet.commands.exit_code import cli_errors
+from fleet.commands.options import from_option, to_option
 from fleet.commands.params import Duration, Number, session_argument
 from fleet.recording import time_spec
 from fleet.recording.left_out import LeftOutCause

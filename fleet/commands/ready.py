@@ -10,7 +10,7 @@ import click
 from fleet.client.car_state import CarState
 from fleet.client.reading import age_of_answer_s
 from fleet.client.supervision import ask_status
-from fleet.commands.options import not_running
+from fleet.commands.exit_code import not_running
 from fleet.supervisor.start_report import describe_start
 from schemas import keys
 from schemas.bus import Bus, BusError, messages_of

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from fleet.client.hints import complete_hints
 from fleet.commands.command_group import choose_fleet, connect_option, fleet_option
-from fleet.commands.options import cli_errors
+from fleet.commands.exit_code import cli_errors
 from fleet.commands.params import Number
 from fleet.coordinator.observer import listed_cars
 from fleet.fleetfile.fleet_file import parse_fleet, read_fleet
