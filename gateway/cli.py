@@ -244,7 +244,7 @@ def _run(arguments: argparse.Namespace) -> int:
             # The car is on the bus now. The imports below take as long as the start up to here, so they come last.
             import asyncio
 
-            from gateway.car import Settings, begin_logging, serve
+            from gateway.car_gateway import Settings, begin_logging, serve
             from gateway.control.battery import BatteryPolicy
             from schemas.rights import NO_PEOPLE
 

@@ -544,7 +544,7 @@ class Console:
     def _on_command(self, page: PageLink, message: PageMessage) -> None:
         request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
         if request.verb in STOPS:
-            self._end_all(self._presses.drop_cars(set(cars)), "The car was stopped.")
+            self._end_all(self._presses.on_cars_stopped(set(cars)), "The car was stopped.")
             who = (page.operator.sender, request.verb)
             self._waiting_stops.setdefault(who, []).append((cars, answer))
             self._merge_stop(("cars", *who), partial(self._stop_cars, page.operator, request, who))

@@ -151,12 +151,12 @@ class PressBook:
         """End every press, because no command can reach a car."""
         return self._end(lambda _: True)
 
-    def drop_cars(self, cars: set[str]) -> list[HeldPress]:
+    def on_cars_stopped(self, cars: set[str]) -> list[HeldPress]:
         """End every press of these cars, because they were stopped."""
         return self._end(lambda press: bool(cars & set(press.cars)))
 
     def drop_cars_of(self, cars: set[str], person: str, people: People = NO_PEOPLE) -> list[HeldPress]:
-        """End presses of these cars, because this person sent them a command that is not a stop.
+        """End presses of these cars, because this person set their mode, or gave them back.
 
         The person's own presses end. A lead of the cars also ends the presses of persons who are not leads.
         """

@@ -19,8 +19,8 @@ from fleet.fleet_links import SimLink, may_be_same, parse_fleet_link
 from fleet.fleetfile.fleet_file import FleetCar
 from gateway import drivers
 from schemas.links import UsbUrl
-from schemas.process import port_users
-from schemas.process.port_permission import permission_hint
+from schemas.process import serial_port_users
+from schemas.process.serial_port_permission import permission_hint
 from schemas.process.usb_bus import CH340, explain_missing_port
 from schemas.words import LinkState
 
@@ -96,11 +96,11 @@ def check_device(path: str) -> tuple[bool, str]:
         return False, "is not a serial port but a file or directory"
     if not os.access(path, os.R_OK | os.W_OK):
         return False, f"no permission. {permission_hint(path)}"
-    holder = port_users.find_holder(file_stat)
+    holder = serial_port_users.find_holder(file_stat)
     if holder is not None:
         return False, f"in use by {holder}. Stop that program first."
-    free = "free" if port_users.LOCKS.exists() else "whether it is free is not known here"
-    users = ", ".join(port_users.find_users(path))
+    free = "free" if serial_port_users.LOCKS.exists() else "whether it is free is not known here"
+    users = ", ".join(serial_port_users.find_users(path))
     shared = f", but {users} has it open and may take its bytes: stop that" if users else ""
     return True, f"there, permitted, {free}{shared}; not opened, because that can reset a car"
 

@@ -23,8 +23,8 @@ from gateway.link.link_exceptions import Busy, CannotOpen, LinkLost
 from gateway.link.serial_port_list import SerialPort, serial_ports
 from gateway.link.usb import ListedPort, check_same_device, choose, list_serial_ports, port_at
 from schemas.links import SerialUrl, UsbUrl
-from schemas.process import port_users
-from schemas.process.port_permission import permission_hint
+from schemas.process import serial_port_users
+from schemas.process.serial_port_permission import permission_hint
 from schemas.process.usb_bus import explain_missing_port
 
 SERIAL_WRITE_TIMEOUT_S: Final = 0.25
@@ -225,7 +225,7 @@ class SerialLink(Link):
     def _find_users(self) -> None:
         with self._lock:
             path = "" if self._port is None else str(self._port.port)
-        users = port_users.find_users(path) if path else []
+        users = serial_port_users.find_users(path) if path else []
         self._call_on_loop(self._on_found, path, users)
 
     def _on_found(self, path: str, users: list[str]) -> None:
@@ -238,7 +238,7 @@ class SerialLink(Link):
             stop = "Stop that program." if len(users) == 1 else "Stop those programs."
             self._trouble = f"{fact}: {', '.join(users)}. {stop}"
         elif path and self._empty_reads:
-            command = port_users.how_to_find_users(path)
+            command = serial_port_users.how_to_find_users(path)
             self._trouble = f"{fact}. `{command}` shows which program: stop it."
 
     # ------------------------------------------------------------------ in the thread
@@ -398,11 +398,11 @@ def _is_rfcomm(path: str) -> bool:
 def _find_holder(path: str) -> str:
     """Return the program that has locked the port, else the programs that have it open."""
     try:
-        holder = port_users.find_holder(os.stat(path))  # noqa: PTH116 - a device path
+        holder = serial_port_users.find_holder(os.stat(path))  # noqa: PTH116 - a device path
     except (OSError, ValueError):
         holder = None
     # A terminal program locks a port in another way (TIOCEXCL, or a lock file), which `find_holder` cannot find.
-    return holder or ", ".join(port_users.find_users(path)) or "another program"
+    return holder or ", ".join(serial_port_users.find_users(path)) or "another program"
 
 
 def _why_gone(error: Exception) -> str:

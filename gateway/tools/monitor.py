@@ -20,7 +20,7 @@ from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.wire_events import Event
 from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
 from gateway.tools import cli_support
-from gateway.tools.statistics import LinkStatistics, describe
+from gateway.tools.link_statistics import LinkStatistics, describe
 from schemas.links import LINK_HELP
 from schemas.words import FrameVerdict, Platform
 

@@ -16,7 +16,7 @@ from gateway.drivers.yahboom.stops.sequences import GENERAL, STOP_REPORT_TIMEOUT
 from gateway.link import Busy, Link, LinkError, LinkUrl, open_link
 from gateway.link.serial_port_list import SerialPort
 from gateway.tools import cli_support
-from gateway.tools.statistics import LinkStatistics
+from gateway.tools.link_statistics import LinkStatistics
 from schemas.words import LinkVerdict, Mode, Platform
 
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from schemas.process.port_users import is_running
+from schemas.process.serial_port_users import is_running
 
 CH340: Final = (0x1A86, 0x7523)
 """Ids of the CH340, the serial adapter of most cars. brltty mistakes it for a Braille display with the same ids."""

@@ -31,7 +31,7 @@ IMPORTED: Final = """
 import sys
 from importlib import import_module, metadata
 for name in (
-    "gateway.car", "gateway.cli", "gateway.stop_without_hub", "gateway.tools.scan",
+    "gateway.car_gateway", "gateway.cli", "gateway.stop_without_hub", "gateway.tools.scan",
     "gateway.drivers.yahboom.driver", "gateway.drivers.waveshare.driver",
     "fleet.cli", "fleet.commands.drive", "fleet.commands.hub", "fleet.commands.observe",
 ):

@@ -336,7 +336,7 @@ def test_of_two_that_want_one_port_one_remains(fleet: FleetProcesses) -> None:
 
 AT_THE_WORD = """
 import sys
-import gateway.car, gateway.cli, gateway.link.tcp
+import gateway.car_gateway, gateway.cli, gateway.link.tcp
 sys.stdout.write("0\\n")
 sys.stdout.flush()
 sys.stdin.readline()

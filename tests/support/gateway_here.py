@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 
 from gateway.bus.car_service import CarService
-from gateway.car import CarGateway, Settings
+from gateway.car_gateway import CarGateway, Settings
 from gateway.link import parse_url
 from schemas import bus
 from schemas.process.computer_sleep import SleepWatch

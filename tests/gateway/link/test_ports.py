@@ -18,7 +18,7 @@ from fleet.fleetfile.link_check import check_device
 from gateway.link import CannotOpen, Link, LinkLost, open_link
 from gateway.link.serial import why_not_open
 from schemas.links import SerialUrl, UsbUrl
-from schemas.process import port_users, usb_bus
+from schemas.process import serial_port_users, usb_bus
 from tests.gateway.link.peers import PtyPeer
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
@@ -59,7 +59,7 @@ class Reader:
         monitor.write_text(READ)
         self.process = subprocess.Popen([sys.executable, monitor, self.port])
         self.words = f"process {self.process.pid} ({' '.join([sys.executable, str(monitor), self.port])[:80]})"
-        wait_for(lambda: self.words in port_users.find_users(self.port), "it has the port open")
+        wait_for(lambda: self.words in serial_port_users.find_users(self.port), "it has the port open")
 
     def close(self) -> None:
         self.process.kill()
@@ -106,7 +106,7 @@ async def test_hidden_second_program_is_found_with_a_command(
     """Programs of other users show their descriptors to root only."""
     link = await open_link(peer.url)
     reader = Reader(tmp_path / "tty")
-    monkeypatch.setattr(port_users, "find_users", lambda _path: [])
+    monkeypatch.setattr(serial_port_users, "find_users", lambda _path: [])
     try:
         words = await until_trouble(link, peer)
     finally:
@@ -221,7 +221,7 @@ async def test_ch340_without_a_port_is_said_and_brltty_named(adapter: Path, tmp_
     shutil.copy("/bin/sleep", tmp_path / "brltty")
     with subprocess.Popen([tmp_path / "brltty", "60"]) as brltty:  # noqa: ASYNC220 - likewise
         try:
-            wait_for(lambda: port_users.is_running("brltty"), "it runs")
+            wait_for(lambda: serial_port_users.is_running("brltty"), "it runs")
             has = f"{plugged}the program for Braille displays, has taken it. Type `sudo apt remove brltty`, then plug"
             assert (await refused(missing)).startswith(f"{missing}: no such port ")
             assert has in await refused(missing)
