@@ -1,7 +1,7 @@
 """Extracts the raw frames of a session in both directions, with their readings and the known mode and platform.
 
 Decodes nothing. The items are in the order of the gateway's stamps, because states may overtake readings on the bus.
-Memory is bounded.
+Only a message that came very late is out of order (`SORTED_NS`). Memory is bounded.
 """
 
 import heapq
@@ -17,8 +17,9 @@ from schemas.topics import TOPICS
 from schemas.words import Mode, Verdict
 
 FRAME_KEYS: Final = ("*/*/frame/*", "*/*/sensor/*", "*/*/state/mode", "*/*/state/health")
-MAX_MESSAGE_DELAY_NS: Final = 10_000_000_000
-"""Maximum delay of a message on the recorder's clock: after an outage of the bus, cached messages come at once."""
+SORTED_NS: Final = 10_000_000_000
+"""How long a message waits, by the recorder's clock, for others with earlier stamps. After an outage of the bus, cached
+messages come that late, all together. The gateway's own clock may be wrong, so it does not count here."""
 _MODE_NAMES: Final = frozenset(map(str, Mode))
 _HEADER_FIELDS: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
@@ -27,7 +28,7 @@ Readings = Mapping[str, Mapping[str, Any]]
 
 
 class Rx(Struct):
-    """Bytes from a car, with the verdict and the readings that were recorded for them."""
+    """Bytes from a car, with the verdict of the decoder on them and the readings that were recorded for them."""
 
     at_ns: int
     data: bytes
@@ -113,11 +114,8 @@ def fields_of(message: Any) -> dict[str, Any]:
 
 
 def _sort_by_stamp(recorded: Iterable[Recorded], skipped: SkippedMessages) -> Iterator[tuple[keys.Key, Any, int]]:
-    """Yield messages by stamp. At equal stamps readings come before their frame.
-
-    Other messages stay in recorded order.
-    """
-    heap: list[tuple[int, bool, int, keys.Key, Any]] = []
+    """Yield messages by stamp. At equal stamps, readings come first, and all else keeps its recorded order."""
+    heap: list[tuple[int, bool, int, int, keys.Key, Any]] = []
     for number, message in enumerate(recorded):
         key = keys.parse(message.key)
         if key is None or (topic := TOPICS.get(key.topic)) is None or topic.message != message.message:
@@ -128,10 +126,10 @@ def _sort_by_stamp(recorded: Iterable[Recorded], skipped: SkippedMessages) -> It
             skipped.broken[message.key] = skipped.broken.get(message.key, 0) + 1
             continue
         at_ns = messages.stamp_ns(value.stamp)
-        heapq.heappush(heap, (at_ns, topic.family != "sensor", number, key, value))
-        while heap and heap[0][0] < message.recorded_ns - MAX_MESSAGE_DELAY_NS:
-            at_ns, _, _, key, value = heapq.heappop(heap)
+        heapq.heappush(heap, (at_ns, topic.family != "sensor", number, message.recorded_ns, key, value))
+        while heap[0][3] < message.recorded_ns - SORTED_NS:
+            at_ns, _, _, _, key, value = heapq.heappop(heap)
             yield key, value, at_ns
     while heap:
-        at_ns, _, _, key, value = heapq.heappop(heap)
+        at_ns, _, _, _, key, value = heapq.heappop(heap)
         yield key, value, at_ns

@@ -1,6 +1,7 @@
 """Recorded frames against today's decoder: recorded vectors have no difference, and each change is found."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,18 @@ from mcap.writer import Writer
 from msgspec.structs import replace
 
 from fleet.cli import cli
+from fleet.recording.reading.session import Recorded
 from fleet.replay.analysis import vector_file
-from fleet.replay.analysis.recorded_frames import Item, KnownMode, KnownPlatform, Rx, Tx
+from fleet.replay.analysis.recorded_frames import (
+    SORTED_NS,
+    Item,
+    KnownMode,
+    KnownPlatform,
+    Rx,
+    SkippedMessages,
+    Tx,
+    of_session,
+)
 from fleet.replay.analysis.redecode import ReadingDifference, Redecoding
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import Mode
@@ -197,3 +208,29 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
     path.touch()
     assert "exists already" in run("sessions", "vector", unknown, "--car", "red", "--out", path).output
     assert "ends in .jsonl" in run("sessions", "vector", unknown, "--car", "red", "--out", tmp_path / "x.tsv").output
+
+
+@pytest.mark.parametrize("ahead_s", [0, -3600, 3600])
+def test_frames_are_in_order_by_the_clock_of_their_gateway(ahead_s: int) -> None:
+    """The clock of a gateway may be wrong by an hour. That neither changes the order nor keeps all messages waiting."""
+    arrived = 0
+
+    def recorded() -> Iterator[Recorded]:
+        nonlocal arrived
+        for number in range(60):
+            arrived += 1
+            # Two messages a second, each second one overtaken by the one before.
+            value = pb.RxFrame(data=TRACKING, verdict="sensors")
+            value.stamp.FromNanoseconds((1000 + ahead_s) * S + (number + (1 if number % 2 else -1)) * S // 2)
+            yield Recorded(
+                "fleet/red/frame/rx", value.SerializeToString(), "fleet.v1.RxFrame", "protobuf",
+                1000 * S + number * S // 2, 1000 * S + number * S // 2, number,
+            )  # fmt: skip
+
+    waiting, stamps = 0, []
+    for _, item in of_session(recorded(), SkippedMessages()):
+        stamps.append(item.at_ns)
+        waiting = max(waiting, arrived - len(stamps))
+    assert len(stamps) == 60
+    assert stamps == sorted(stamps)
+    assert waiting <= 2 * SORTED_NS // S + 2
