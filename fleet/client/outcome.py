@@ -62,7 +62,7 @@ class Outcome:
     basis: str = ""
     """For a stop: `shown` if the car's readings show that it stands still, `sent` if they cannot.
 
-    For a drive: `shown` if a reading shows that the car moved, `sent` if none does.
+    For a drive: `sent`, because no reading proves that the car drove.
     """
     effect: str = ""
     """The effect of the command in words: `LED color sent`, `stopped (1.2 s)`, `sent for 3.0 s`, `refused: ...`."""

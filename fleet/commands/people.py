@@ -26,7 +26,7 @@ def pause(client: Fleet, why: str, *, as_json: bool) -> None:
 @json_option
 @with_client
 def unpause(client: Fleet, *, as_json: bool) -> None:
-    """End the pause of the fleet. This does not move a car: a stopped car stays on hold."""
+    """End the pause of the fleet. A plan may move cars at once. A car that was on hold before stays on hold."""
     end_with(client, client.unpause(), as_json=as_json)
 
 

@@ -1,6 +1,7 @@
 """Requests of the pages about recordings: the recorder, the list of sessions, verify, download, export, and Rerun.
 
-The work runs in separate processes with a low priority, because a session of gigabytes must not delay a STOP.
+A session of gigabytes must not delay a STOP. So lists, verify and exports run in separate processes with a low
+priority, and threads read what is downloaded.
 """
 
 import asyncio
@@ -31,7 +32,7 @@ from schemas.suggestion import how_to_install
 from schemas.words import RecorderVerb
 
 MAX_EXPORTS: Final = 4
-"""Maximum number of exports that wait for their download."""
+"""Maximum number of exports that are kept for downloads. Beyond it, the oldest one is deleted."""
 FORMATS: Final = ("csv", "parquet")
 _MAX_REQUEST_BYTES: Final = 8192
 
@@ -225,7 +226,10 @@ def session_row(listed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _moment(text: object) -> dict[str, int | None]:
-    """Return a time (ms since the epoch), and this computer's offset from UTC then (s). None if it is not a time."""
+    """Return a time (ms since the epoch), and this computer's offset from UTC at that time (s).
+
+    If the text is no time, return None and 0.
+    """
     try:
         at_s = datetime.fromisoformat(str(text)).timestamp()
         return {"at_ms": round(at_s * 1000), "zone_s": time.localtime(at_s).tm_gmtoff}

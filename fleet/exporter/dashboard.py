@@ -1,4 +1,6 @@
-"""Makes the Grafana dashboard from the table of metrics: deploy/grafana.json, and `fleet exporter --dashboard`. Pure.
+"""Makes the Grafana dashboard from the table of metrics. `fleet exporter --dashboard` prints it. Pure.
+
+deploy/grafana.json is a copy of it.
 
 The data source is an input of the dashboard: Grafana asks for it when somebody imports the dashboard.
 """
@@ -12,8 +14,8 @@ _COLUMNS: Final = 24  # of Grafana's grid
 _WIDTH: Final = 12
 _HEIGHT: Final = 7
 _WORDS: Final = ("state", "mode")
-"""Labels with one value for each possible word: 1 for the word that applies, 0 for the rest. A time line shows that
-word."""
+"""Labels whose values are words. Such a metric has one series for each word: 1 if the word applies, else 0. A time line
+shows the word that applies."""
 
 
 def dashboard() -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """The one table of metrics: names, labels, values and the panels that show them. Pure: time is an argument.
 
-A car whose gateway has gone has only `fleet_car_up`, which is 0. A stale message gives no value. So no number is ever
-older than its topic allows. The values of labels are only words from fixed sets, and names of cars that have or had a
-gateway.
+A car whose gateway has gone has `fleet_car_up`, which is 0, and its counters of commands and refusals, but no other
+metric. A stale message gives no value. So no measured number is ever older than its topic allows. The values of labels
+are only words from fixed sets, and names of cars that have or had a gateway.
 """
 
 from collections.abc import Callable, Iterable, Iterator

@@ -60,7 +60,7 @@ def list_ports() -> "list[ListPortInfo]":
 
 
 def choose(url: UsbUrl, ports: Iterable[ListedPort]) -> ListedPort:
-    """Return the only matching port. If there are none or several, the message of CannotOpen lists the ports."""
+    """Return the only matching port. If there are none or several, CannotOpen says what was found instead."""
     available = sorted(ports, key=lambda port: port.device)
     fit = [port for port in available if url.fits(port.vid, port.pid, port.serial)]
     if len(fit) == 1:
@@ -90,13 +90,13 @@ def check_same_device(url: SerialUrl | UsbUrl, path: str, first: ListedPort | No
         return
     if now is None and not os.path.exists(path):  # noqa: PTH110 - a device path, not a file to work with
         return  # the caller opens it next, which raises an error that says why
-    found = f"{path}, about which the system says nothing" if now is None else _named([now])
+    found = f"{path}, which the system does not list, may be" if now is None else f"{_named([now])} is"
     raise CannotOpen(
-        f"{url}: another device is there, {found}; it was {_named([first])}. Plug the earlier device in again, or "
+        f"{url}: {found} another device than before, which was {_named([first])}. Plug the earlier device in again, or "
         "restart this program to use the other one"
     )
 
 
 def _named(ports: list[ListedPort]) -> str:
-    """Return the ports as one line. A device chooses its own name: replace what cannot be printed."""
+    """Return the ports as one line. A device chooses its own serial number: replace what cannot be printed."""
     return printable(", ".join(map(str, ports)), "?")

@@ -40,7 +40,7 @@ def _thing_change(fields: Mapping[str, object], thing: MovingObject) -> Change:
     given = _numbers("thing", fields, _THING, ())
     speed = given.pop("speed_m_s", None)
     if speed is not None and (not thing.path or given):
-        why = "with x_m or y_m it leaves its path" if given else f"{thing.name} has no path"
+        why = "with x_m or y_m it leaves its path" if thing.path else f"{thing.name} has no path"
         raise BadSpec(f"speed_m_s {speed:g} is not allowed: {why}")
 
     def change(world: World, now: float) -> None:

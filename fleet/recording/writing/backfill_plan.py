@@ -2,14 +2,16 @@
 
 When should the recorder ask? After its own link to the hub is back: it asks all. After a gap in the numbers of a
 publisher, which shows that the *car* was cut off: it asks all publishers of this car, because some of them are silent
-for minutes. If the car's state has a gap, its next command event may have one too, but shows it only when it comes, and
-after the last command none comes. And the recorder asks at the start, if it continues an interrupted session.
+for minutes. The command events of this car may have a gap, too. Only the next event would show it, and after the last
+command there is no next event. And the recorder asks shortly after its start. If it continues an interrupted session,
+it asks at once, too, and further back.
 
 One query is not enough, because others may reconnect half a second later than we do, and on a loaded machine even
-later. So each cause plans several (`QUERY_AFTER_...`). Their answers overlap, but that does no harm: every message has
-a number, and the writer knows which ones it has. And a link that is back may be lost again before anybody was asked. So
-the plan keeps a source until its answers had all keys with gaps. It asks the source again with its next cause, from the
-time at which its first gap began, and once more at the end of the recording.
+later. So a reconnect and a gap plan several queries each (`QUERY_AFTER_...`). Their answers overlap, but that does no
+harm: every message has a number, and the writer knows which ones it has. And a link that is back may be lost again
+before anybody was asked. So the plan remembers a source, which is a car or a service, until its answers contain every
+key that has a gap. It asks this source again at the next reconnect or gap, from the time at which its first gap began,
+and once more at the end of the recording.
 
 How far back should it ask? The window of a query is relative ("the last 13 s"), and the publisher counts it back from
 the arrival of the query, with its own clock. So it works even if that clock is wrong by an hour, unlike an absolute
@@ -31,13 +33,13 @@ QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
 machine."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
 QUERY_INTERVAL_S: Final = 1.0
-"""Minimum interval of the first queries of two gaps of one source. A network that loses messages all the time would
-otherwise be asked for a whole car five times a second."""
+"""Minimum time between two first queries of one source. Otherwise, on a network that loses messages all the time, a car
+would be asked for all of its messages five times a second."""
 GAP_MARGIN_S: Final = 2.0
 """Margin of a window for two delays of the network. The last message before the gap was published before it arrived, so
 the gap may begin earlier than that. And the publisher counts the window back from the late arrival of the query."""
 MAX_ANSWERS_OF_OTHERS: Final = 10
-"""Number of answers of others of its source after which a key is given up: its publisher has no cache."""
+"""A key is given up after this many answers of its source that do not contain it: its publisher has no cache."""
 MAX_SINGLE_SOURCES: Final = 16
 """Maximum number of sources to ask one by one. If there are more, ask everything."""
 EVERYTHING: Final = ""
@@ -52,15 +54,15 @@ class PlannedQuery(Struct, frozen=True):
 
 
 class _Asked(Struct):
-    """A source that has to be asked. Without `due`, it waits for its next cause."""
+    """A source that has to be asked. Without `due`, it is asked again at the next gap or reconnect."""
 
     due: list[tuple[float, float]] = field(default_factory=list)
     """When to ask, and since when messages may be missing."""
     unanswered_since: float = inf
-    """The earliest time for which no query was answered."""
+    """The earliest time from which a query asked for messages that was not answered yet, or inf."""
     keys: dict[str, int] = field(default_factory=dict)
-    """Keys with gaps, and how often others of this source have answered meanwhile. The publishers of these keys have to
-    answer, because a car may have others."""
+    """Keys with gaps, each with the number of answers that did not contain it. A car has several publishers, so an
+    answer of another one does not count as an answer for this key."""
     asked_at: float = -inf
 
 
@@ -68,7 +70,7 @@ class BackfillPlan:
     """The queries of one recorder. A source is a car or a service: the first two chunks of its keys."""
 
     def __init__(self, now: float, *, resume_since: float | None = None) -> None:
-        """Begin. `resume_since`: when the interrupted session ended that this one continues."""
+        """Begin. `resume_since`: the time from which to ask if this recording continues an interrupted session."""
         self._asked: dict[str, _Asked] = {}
         if resume_since is None:
             self._plan(EVERYTHING, now, QUERY_AFTER_START_S, now)
@@ -107,7 +109,10 @@ class BackfillPlan:
         return self._queries(self._asked, inf)
 
     def add_answers(self, query: PlannedQuery, answered: Collection[str]) -> None:
-        """Take the keys that a whole answer has. Forget the sources that have answered their last query."""
+        """Take the keys in a complete answer, which did not break off.
+
+        Forget a source for which no query is due, if all its keys with gaps were answered or given up.
+        """
         for source in {EVERYTHING, *map(source_of, answered)} if query.source == EVERYTHING else {query.source}:
             asked = self._asked.get(source)
             if asked is None or not (answered or source == EVERYTHING):

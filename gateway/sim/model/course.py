@@ -1,4 +1,4 @@
-"""The Raspberry Pi program of a course. It knows a table of exact frames, ends at any other one, and sends nothing.
+"""A Raspberry Pi program from a training course: it knows some exact frames, ends at any other one, and sends nothing.
 
 The program was run (docs/reference/protocol.md#programs-that-people-have). Its speed, and the frames that it knows
 besides the motions, are assumptions.
@@ -16,7 +16,7 @@ _AT_REST: Final = "$0,0,0,0,0,0,0,0,0#"
 
 
 def _with(place: int, digit: str) -> str:
-    """Return the frame at rest with another digit at a place, 1 to 9."""
+    """Return the frame at rest with another digit at this place of its nine."""
     at = 2 * place - 1
     return _AT_REST[:at] + digit + _AT_REST[at + 1 :]
 

@@ -1,7 +1,7 @@
 """Estimates the mode of the car from the commanded mode and the readings. The car never reports its mode.
 
-Silence never confirms a mode, so a silent mode is at best assumed. The table tests/vectors/mode_truth.tsv lists which
-modes can be distinguished, and how soon. The tests check that table.
+Silence never confirms a mode, so a mode in which this car sends nothing is at best assumed. The table
+tests/vectors/mode_truth.tsv lists which modes can be distinguished, and how soon. The tests check that table.
 """
 
 from collections import deque
@@ -21,8 +21,8 @@ CONTRADICTING_FRAMES: Final = 3
 (docs/explanation/how-sure-is-a-mode.md#contradiction)."""
 MANUAL_SILENCE_S: Final = 3.0
 RUNNING_SILENCE_S: Final = 1.0
-"""Minimum silence that contradicts mode 0 (the first), or modes 2, 5 and 6 (the second). The time of known blocks, and
-of a running fan, is not counted."""
+"""Minimum silence that contradicts mode 0 (the first), or modes 2, 5 and 6 (the second). The time of known blocks is
+not counted, nor that of a running fan if it may silence the car."""
 FIRST_SILENCE_S: Final = 5.0
 """Minimum silence that contradicts mode 0 while the usual interval of the car's reports is not known yet."""
 SILENCE_MARGIN_S: Final = 0.75
@@ -34,7 +34,7 @@ MAX_FADE_EXCUSE_S: Final = SERVO_S
 """Maximum time by which blocks prolong a confirmation: the block of a servo. In a block, the car is busy with a frame
 of ours, and sends nothing. A stream of actions must not keep a claim alive that no reading supports any more."""
 MAX_BLOCKS: Final = 256
-"""Maximum number of blocking frames that are remembered to excuse a silence, as during endless whistling."""
+"""Maximum number of blocking frames that are remembered. Only somebody who whistles without end reaches it."""
 
 
 class ModeEstimator(Struct):
@@ -44,7 +44,8 @@ class ModeEstimator(Struct):
     learned: Learned = field(default_factory=Learned)
     asked: Mode | None = None
     inferred: Mode | None = None
-    """The only mode that fits the last readings or the silence, or None if several or none fit."""
+    """The only mode that fits the last readings or the silence, or None if several or none fit. While a mode is
+    confirmed, ambiguous readings do not change it."""
     verdict: Verdict = Verdict.ASSUMED
     evidence: str = "no reading yet"
     evidence_at: float | None = None
@@ -54,9 +55,9 @@ class ModeEstimator(Struct):
     """Candidate modes. Empty if the car should report in every mode but is silent."""
     _asked_at: float = field(default=float("-inf"))
     _in_mode_by: float = field(default=float("-inf"))
-    """The latest time at which a car that obeys is in the commanded mode."""
+    """The time by which a car that obeys has entered the commanded mode."""
     _in_same_mode_by: float = field(default=float("-inf"))
-    """The latest time at which a car is in the commanded mode if it was in this mode already at the last frame."""
+    """The time by which a car has entered the commanded mode if it was in this mode already at the last frame."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
     _other_at: float = field(default=float("-inf"))
@@ -67,7 +68,7 @@ class ModeEstimator(Struct):
     """The longest silence on this link that proved to be normal for this car (`allow_silence`)."""
     _matches: int = 0
     _mismatches: int = 0
-    """Number of consecutive readings that fit the commanded mode, and that do not."""
+    """Number of consecutive readings that fit only the commanded mode, and that do not fit it."""
     _blocks: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=MAX_BLOCKS))
     """Time and duration of each block by one of our frames."""
 
@@ -83,8 +84,8 @@ class ModeEstimator(Struct):
 
     def on_mode_sent(self, mode: Mode, *, now: float, block_s: float) -> None:
         """Record a written frame that brings the car into `mode` and blocks it for `block_s`."""
-        # The car obeys after the block of the previous frame and one turn of the previous mode. If that mode is
-        # unknown, assume the slowest one.
+        # The car obeys after the block of the previous frame, and when the loop of the previous mode has run through
+        # once. If that mode is unknown, assume the slowest one.
         previous = self.asked if self.verdict is not Verdict.CONTRADICTED else None
         turn_s = self.profile.mode_turn_s(previous or Mode.OBSTACLE_AVOIDANCE)
         self._in_mode_by = max(self._in_mode_by, now + turn_s) + block_s
@@ -194,7 +195,11 @@ class ModeEstimator(Struct):
         """Return why a silence of the car is expected, in words."""
         if self.asked is None:
             return "in an unknown mode a car may be silent"
-        if self.asked in self.profile.silent_modes or self.asked is Mode.MANUAL:
+        if not self.profile.has_readings:
+            return "this car sends no readings"
+        if self.asked is Mode.MANUAL:
+            return "its fan may be on"
+        if self.asked in self.profile.silent_modes:
             return f"{self.asked} is silent"
         return f"it is not known whether this car reports in {self.asked}"
 
@@ -263,8 +268,8 @@ class ModeEstimator(Struct):
 
     def _silence_s(self, heard_at: float, now: float) -> float:
         since = max(heard_at, self._in_mode_by, self._excused_at)
-        # Do not count older blocks: the car had obeyed those frames before it began this reading, whose ranging took
-        # 1.0 s at most.
+        # Do not count blocks that are much older than the last reading: the car had obeyed those frames before it began
+        # that reading, which takes up to 1.0 s of ranging.
         return now - since - sum(block_s for at, block_s in self._blocks if at > since - REPEAT_INTERVAL_S)
 
     def _set_candidates(self, candidates: tuple[Mode, ...]) -> None:
