@@ -32,7 +32,7 @@ from fleet.commands.options import bus_options, json_option
 from fleet.commands.output import show_table
 from fleet.commands.params import Number
 from fleet.console import DEFAULT_PORT
-from fleet.console.pairing import RANKS, PagePerson, UnknownPerson
+from fleet.console.people_book import RANKS, PagePerson, UnknownPerson
 from fleet.console.people_file import PeopleFile, people_path
 from fleet.console.server import HELLO, listen, serve
 from fleet.fleetfile.fleet_file import people_table, read_people
@@ -280,27 +280,22 @@ def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
         click.echo(f"{each.id} ({each.person.name}) is revoked. Its pages are closed.")
 
 
-def _network() -> Any:
-    from fleet.console import network_console  # importing it takes 0.1 s; only --lan and `pair` need it
-
-    return network_console
-
-
 def _people_of(file: Path) -> People:
     """Return the people in a fleet file. Nobody if the file cannot be read."""
     return people_table(read_people(file))
 
 
 def _open_lan(port: int, people: PeopleFile, listed: People) -> "Lan":
-    network = _network()
+    from fleet.console import network_console  # importing it takes 0.1 s; only --lan needs it
+
     try:
-        listener = network.LimitedListener.on_port(port)
+        listener = network_console.LimitedListener.on_port(port)
     except OSError as error:
         raise click.ClickException(
             f"Port {port} is not free ({error.strerror}). `fleet console --lan --lan-port 0` uses a free one."
         ) from None
     try:
-        lan: Lan = network.Lan(listener, people, listed)
+        lan = network_console.Lan(listener, people, listed)
     except OSError as error:
         listener.close()
         raise click.ClickException(
@@ -319,12 +314,13 @@ def _describe_lan(lan: "Lan") -> None:
 
 
 def _show_code(people: PeopleFile, address: str, person: PagePerson) -> None:
-    network = _network()
+    from fleet.console import pairing  # importing it takes 0.1 s; only --lan and `pair` need it
+
     try:
-        code = network.issue_code(people, person)
+        code = pairing.issue_code(people, person)
     except OSError as error:
         raise _not_written(people, error) from None
-    network.show_code(address, code, person, click.echo, draws=sys.stdout.isatty())
+    pairing.show_code(address, code, person, click.echo, draws=sys.stdout.isatty())
 
 
 def _not_written(people: PeopleFile, error: OSError) -> click.ClickException:

@@ -28,7 +28,7 @@ from schemas.printable import printable
 
 if TYPE_CHECKING:
     from fleet.conditions import Expression
-    from fleet.recording.tools.find import Found, Hit
+    from fleet.recording.tools.condition_search import Found, Hit
 
 MAX_FOR_S: Final = 86_400.0
 """Maximum of --for. Recordings of lessons and demos are not longer than a day."""
@@ -113,7 +113,7 @@ def _search(
 ) -> Iterator[tuple[Path, "Found"]]:
     """Search the sessions. Yield each with its hits, and print on stderr what could not be searched."""
     from fleet.recording.reading.session import NoSession, Session
-    from fleet.recording.tools.find import find_in
+    from fleet.recording.tools.condition_search import find_in
     from fleet.recording.tools.summary import of_session
 
     try:

@@ -22,7 +22,8 @@ from fleet.hub import local_hub
 from fleet.hub.addresses import own_addresses, own_names
 from fleet.hub.discovery import announced, hubs_found
 from fleet.hub.hub_store import HubStore, KnownIdentity
-from fleet.hub.invitation import JOIN_PORT, Invitation, join, join_one_of
+from fleet.hub.invitation import Invitation
+from fleet.hub.join import JOIN_PORT, join, join_one_of
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
 from schemas.bus import LOOPBACK, Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings

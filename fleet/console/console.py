@@ -27,7 +27,7 @@ from fleet.console.bus_message import is_shown, message_in
 from fleet.console.car_view import MAX_OTHER_CARS, FleetView
 from fleet.console.connection_limit import LogLimit
 from fleet.console.hold_to_drive import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
-from fleet.console.inspections import Inspections
+from fleet.console.inspect_feed import Inspections
 from fleet.console.lane_feed import LaneFeed
 from fleet.console.map_feed import MapFeed
 from fleet.console.operator import ConsoleOperator
@@ -35,8 +35,8 @@ from fleet.console.operators import Operators
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
 from fleet.console.page_requests import BadPageMessage, PageMessage
-from fleet.console.pairing import MAX_GUESTS, PagePerson
 from fleet.console.past_api import PastApi
+from fleet.console.people_book import MAX_GUESTS, PagePerson
 from fleet.console.plan_feed import PlanFeed
 from fleet.console.plot_buffer import plottable
 from fleet.console.plot_feed import PlotFeed

@@ -1,9 +1,7 @@
-"""The console on the network: HTTPS, pairing, and who is connected. The decisions are in the pure modules."""
+"""The console on the network: HTTPS, and which devices are connected. `pairing` pairs them, pure modules decide."""
 
 import asyncio
-import io
 import logging
-import secrets
 import socket
 import ssl
 import time
@@ -12,28 +10,14 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
-import segno
 from msgspec.structs import replace
 
 from fleet.console.certificate import Certificate, ensure_certificate
 from fleet.console.connection_limit import ConnectionLimit, LogLimit
-from fleet.console.pairing import (
-    CLASS_LIFETIME_S,
-    CODE_LIFETIME_S,
-    COOKIE_LIFETIME_S,
-    COOKIE_MEMORY_S,
-    CookieState,
-    GuessLimit,
-    PagePerson,
-    PairedDevice,
-    PeopleBook,
-    TooManyGuesses,
-    WrongCode,
-    code_words,
-    new_code,
-)
+from fleet.console.pairing import Pairing
+from fleet.console.people_book import COOKIE_LIFETIME_S, COOKIE_MEMORY_S, CookieState, PagePerson, PairedDevice
 from fleet.console.people_file import PeopleFile
-from fleet.console.request_filter import DEVICE, PAIR_PATH, Scope
+from fleet.console.request_filter import DEVICE, Scope
 from fleet.hub.addresses import own_addresses, own_names
 from schemas.rights import NO_PEOPLE, People
 
@@ -120,7 +104,7 @@ class Lan:
         self.people = people
         self.port: int = listener.getsockname()[1]
         self.cookie = f"__Host-fleet_console_{self.port}"
-        self.guesses = GuessLimit()
+        self.pairing = Pairing(people, listener.on_paired)
         self.addresses = own_addresses()
         self.names = frozenset(own_names())
         self.certificate: Certificate = ensure_certificate((*self.addresses, *own_names()))
@@ -144,30 +128,7 @@ class Lan:
         """The address to open on a phone."""
         return f"https://{self.addresses[0] if self.addresses else '127.0.0.1'}:{self.port}"
 
-    # ------------------------------------------------------------------ pairing
-
-    async def issue(self, person: PagePerson) -> str:
-        """Return a new code, good once and for two minutes. Raises ValueError or OSError."""
-        return await asyncio.to_thread(issue_code, self.people, person)
-
-    async def offer(self, person: PagePerson) -> dict[str, Any]:
-        """Return a new code as JSON values: as words and as a picture. Raises ValueError or OSError."""
-        code = await self.issue(person)
-        qr = segno.make(pairing_link(self.address, code)).svg_data_uri(scale=5, border=4, light="#fff", dark="#000")
-        return {"code": code_words(code), "qr": qr, "address": self.address, "lifetime_s": CODE_LIFETIME_S}
-
-    async def open_class(self) -> dict[str, Any]:
-        """Open the console for a class. Return its code as JSON values. Raises ValueError or OSError."""
-        code = new_code(secrets.choice)
-        await asyncio.to_thread(self.people.change, lambda book: (book.open_class(code, time.time()), None))
-        qr = segno.make(pairing_link(self.address, code)).svg_data_uri(scale=10, border=4, light="#fff", dark="#000")
-        log.warning("a class may join for %.0f minutes: its devices watch and stop", CLASS_LIFETIME_S / 60)
-        shown = {"code": code_words(code), "qr": qr, "address": self.address, "lifetime_s": CLASS_LIFETIME_S}
-        return shown | {"fingerprint": self.certificate.fingerprint}
-
-    async def close_class(self) -> None:
-        """Let no more devices of a class join. Raises OSError."""
-        await asyncio.to_thread(self.people.change, lambda book: (book.close_class(), None))
+    # ------------------------------------------------------------------ devices
 
     async def assign(self, device_id: str, person: PagePerson) -> None:
         """Make a guest a person. Its pages connect again as that person. Raises ValueError or OSError."""
@@ -177,49 +138,12 @@ class Lan:
             if device == device_id:
                 renew()
 
-    async def pair(
-        self, code: str, client: tuple[str, int], device: str, cookie_before: str = ""
-    ) -> tuple[str, PagePerson]:
-        """Pair a device. Return its cookie and its person.
-
-        cookie_before: the cookie that the device has already, if any. If the code is that of a class, a paired device
-        keeps its person. Raises ClassFull, WrongCode, and TooManyGuesses while the address has to wait.
-        """
-        now, address = time.monotonic(), client[0]
-        if (wait_s := self.guesses.wait_s(address, now)) > 0:
-            self.guesses.wrong += 1
-            raise TooManyGuesses(wait_s)
-        book = self.people.read()
-        known, state = book.device_of(cookie_before, time.time())
-        if known is not None and state == "valid" and book.is_class_code(code, time.time()):
-            return cookie_before, known.person
-        cookie = secrets.token_urlsafe(32)
-        found = book.redeem(code, cookie, "", device, time.time())
-        if found is not None:
-            found = await asyncio.to_thread(self.people.change, lambda book: self._redeemed(book, code, cookie, device))
-        if found is None:
-            count = self.guesses.on_wrong(address, now)
-            log.warning("%s typed a wrong pairing code (%d from there, %d in all)", address, count, self.guesses.wrong)
-            raise WrongCode(self.guesses.wait_s(address, now))
-        self.guesses.on_right(address)
-        paired = found.devices[-1]
-        log.warning("%s paired as %s, %s (%s)", address, paired.person.name, paired.person.rank, paired.id)
-        self.listener.on_paired(client, paired.id)
-        return cookie, paired.person
-
-    @staticmethod
-    def _redeemed(book: PeopleBook, code: str, cookie: str, device: str) -> tuple[PeopleBook, PeopleBook | None]:
-        found = book.redeem(code, cookie, secrets.token_hex(3), device, time.time())
-        return (book, None) if found is None else (found, found)
-
     def set_cookie(self, cookie: str) -> str:
         """Return the header that gives a browser its cookie."""
         # The browser keeps the cookie for longer than the cookie opens the console, because an expired one still stops
         # the cars.
         age = int(COOKIE_LIFETIME_S + COOKIE_MEMORY_S)
         return f"{self.cookie}={cookie}; Path=/; Max-Age={age}; Secure; HttpOnly; SameSite=Strict"
-
-    # ------------------------------------------------------------------ devices
 
     def device_of(self, cookie: str) -> tuple[PairedDevice | None, CookieState]:
         """Return the device of a cookie, and what the cookie may do."""
@@ -336,7 +260,7 @@ class Lan:
             "address": self.address,
             "people": self.people.read().people or (),
             "fingerprint": self.certificate.fingerprint,
-            "wrong_codes": self.guesses.wrong,
+            "wrong_codes": self.pairing.guesses.wrong,
             "devices": devices,
         }
 
@@ -344,25 +268,3 @@ class Lan:
 def _names_of(listed: People) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
     """Return the people and the leads for the people file, or None if the fleet lists nobody."""
     return (None, None) if listed.roles is None else (tuple(sorted(listed.roles)), listed.leads)
-
-
-def issue_code(people: PeopleFile, person: PagePerson) -> str:
-    """Return a new code, good once and for two minutes. Raises ValueError or OSError."""
-    code = new_code(secrets.choice)
-    people.change(lambda book: (book.issue(code, person, time.time()), None))
-    return code
-
-
-def pairing_link(address: str, code: str) -> str:
-    """Return what the QR code contains. The code is in the fragment, which browsers do not send."""
-    return f"{address}{PAIR_PATH}#{code}"
-
-
-def show_code(address: str, code: str, person: PagePerson, write: Callable[[str], object], *, draws: bool) -> None:
-    """Write a pairing code to a terminal. With `draws`, also as a QR code."""
-    if draws:
-        picture = io.StringIO()
-        segno.make(pairing_link(address, code)).terminal(picture, compact=True, border=2)
-        write(picture.getvalue())
-    write(f"To pair a device as {person.name}, scan, or open {address} and type {code_words(code)}")
-    write("The code works once, for 2 minutes. For another code, type: fleet console pair NAME")

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
 
 from fleet.console.operator import ConsoleOperator
-from fleet.console.pairing import PagePerson
+from fleet.console.people_book import PagePerson
 
 SEND_TIMEOUT_S: Final = 5.0
 """Timeout of one message. A page that does not read for this time is disconnected."""

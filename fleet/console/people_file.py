@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, TypeVar
 
-from fleet.console.pairing import BadBook, PeopleBook
+from fleet.console.people_book import BadBook, PeopleBook
 from schemas.atomic_file import write_atomically
 from schemas.process.file_lock import FileLock
 from schemas.state_dir import directory_of

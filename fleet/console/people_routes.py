@@ -8,8 +8,9 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
+from fleet.console.guess_limit import TooManyGuesses, WrongCode
 from fleet.console.page_requests import BadPageMessage, PageMessage
-from fleet.console.pairing import ClassFull, PagePerson, TooManyGuesses, WrongCode
+from fleet.console.people_book import ClassFull, PagePerson
 from fleet.console.request_body import read_text
 from fleet.console.request_filter import PAIR_PATH, PERSON, Scope
 from schemas.words import Rank
@@ -35,7 +36,7 @@ def pair_routes(lan: "Lan") -> list[Route]:
         device = request.headers.get("user-agent", "")[:_MAX_DEVICE_LENGTH]
         before = request.cookies.get(lan.cookie, "")
         try:
-            cookie, person = await lan.pair(code, (request.client.host, request.client.port), device, before)
+            cookie, person = await lan.pairing.pair(code, (request.client.host, request.client.port), device, before)
         except ClassFull as error:
             return _failure(str(error), 409)
         except WrongCode as error:
@@ -73,16 +74,17 @@ def people_routes(lan: "Lan | None") -> list[Route]:
                 gone = await lan.revoke([message.text("id")])
                 return JSONResponse({"ok": bool(gone)})
             if message.kind == "open_class":
-                return JSONResponse({"ok": True, **await lan.open_class()})
+                opened = await lan.pairing.open_class(lan.address)
+                return JSONResponse({"ok": True, **opened, "fingerprint": lan.certificate.fingerprint})
             if message.kind == "close_class":
-                await lan.close_class()
+                await lan.pairing.close_class()
                 return JSONResponse({"ok": True})
             if message.kind == "assign":
                 await lan.assign(message.text("id"), PagePerson(message.text("name")))
                 return JSONResponse({"ok": True})
             if message.kind == "pair":
                 person = PagePerson(message.text("name"), message.text("rank"))
-                return JSONResponse({"ok": True, **await lan.offer(person)})
+                return JSONResponse({"ok": True, **await lan.pairing.offer(person, lan.address)})
             return _failure(f'There is no request "{message.kind}".', 400)
         except (BadPageMessage, ValueError) as error:
             return _failure(str(error), 400)

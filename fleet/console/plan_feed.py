@@ -15,7 +15,7 @@ from fleet.console.operator import ConsoleOperator
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
 from fleet.console.page_requests import PageMessage
-from fleet.console.pairing import PagePerson
+from fleet.console.people_book import PagePerson
 from fleet.console.plan_answer import PlanQuestion
 from fleet.console.plan_checks import PlanChecks
 from fleet.console.plan_process import PlanProcess

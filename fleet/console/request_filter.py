@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, MutableMapping
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final
 
-from fleet.console.pairing import CookieState, PairedDevice
+from fleet.console.people_book import CookieState, PairedDevice
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]

@@ -30,7 +30,7 @@ from fleet.console.entrance import Entrance
 from fleet.console.fair_socket import FairWebSocket
 from fleet.console.log_rate import LogRate
 from fleet.console.page_requests import is_stop
-from fleet.console.pairing import PagePerson
+from fleet.console.people_book import PagePerson
 from fleet.console.people_routes import pair_routes, people_routes
 from fleet.console.plan_view import plan_name
 from fleet.console.request_body import read_text

@@ -21,7 +21,7 @@ from starlette.routing import Route
 
 from fleet.aio import Fleet
 from fleet.client.services import ask_recorder, why_unrecorded
-from fleet.console.pairing import PagePerson
+from fleet.console.people_book import PagePerson
 from fleet.console.request_body import read_start
 from fleet.console.request_filter import PERSON
 from fleet.console.session_files import NotInFolder, files_of, read_file, session_path, zip_files

@@ -11,7 +11,7 @@ from typing import Final
 
 from fleet.hub.addresses import own_addresses, own_names
 from fleet.hub.hub_store import HubStore
-from fleet.hub.invitation import Joined, NotJoined
+from fleet.hub.join import Joined, NotJoined
 from schemas import identity
 from schemas.atomic_file import write_atomically
 from schemas.bus import LOOPBACK, is_secure

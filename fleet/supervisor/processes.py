@@ -16,7 +16,7 @@ from fleet.supervisor import cpu_time
 from fleet.supervisor.child import Child
 from fleet.supervisor.hang import Pulse, WatchClock, have_common_cause, longest_hub_silence_s, longest_silence_s
 from fleet.supervisor.log_files import Log
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, HUNG, WRONG_USE_RETRY_S, ProcessState, RestartAction
+from fleet.supervisor.process_state import GATEWAY_GRACE_S, HUNG, WRONG_USE_RETRY_S, ProcessState, RestartAction
 from fleet.supervisor.spec import PATIENCE
 from fleet.supervisor.start_limit import Admission
 from schemas.words import ProcessKind, RunState

@@ -16,8 +16,8 @@ from fleet.client.claims import (
     rest_words,
 )
 from fleet.supervisor.car_status import CarStatus
+from fleet.supervisor.process_state import GATEWAY_GRACE_S, WRONG_USE, delay_s
 from fleet.supervisor.processes import ManagedProcess, ProcessSet
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S, WRONG_USE, delay_s
 from schemas.words import Basis, LinkState, Motors, RunState
 
 LAST_CLAIM_TIMEOUT_S: Final = 1.0

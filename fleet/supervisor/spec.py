@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from fleet.fleetfile.fleet_file import FleetCar, FleetFile, FleetPerson, PinRule, default_color, profile_capabilities
 from fleet.fleetfile.fleet_model import PersonRank
 from fleet.quota import Quota
-from fleet.supervisor.restart_policy import Patience
+from fleet.supervisor.process_state import Patience
 from gateway import drivers
 from schemas.keys import DEFAULT_FLEET
 from schemas.platform_name import AUTO

@@ -25,9 +25,9 @@ from fleet.policy.denial_words import fleet_refusal
 from fleet.supervisor import spec
 from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.log_files import Log, new_run, remove_links, write_copy
+from fleet.supervisor.process_state import GATEWAY_GRACE_S
 from fleet.supervisor.processes import SUPERVISOR_POLL_INTERVAL_S, ManagedProcess, ProcessSet
 from fleet.supervisor.reload import compare
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
 from fleet.supervisor.shutdown import NOT_TRIED, GatewayShutdown, describe_end
 from fleet.supervisor.spec import (
     CONSOLE,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from fleet.client.client import Fleet
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from fleet.supervisor.process_state import GATEWAY_GRACE_S
 from schemas.process.children import OWN_GROUP, end
 from schemas.process.parent import parent_option
 from schemas.words import Motors

@@ -14,7 +14,8 @@ import psutil
 import zenoh
 
 from fleet.hub.hub_store import HubStore
-from fleet.hub.invitation import Invitation, join
+from fleet.hub.invitation import Invitation
+from fleet.hub.join import join
 from schemas import keys
 from schemas.bus.credentials import Credentials
 from schemas.identity import car, person

@@ -14,7 +14,7 @@ import pytest
 from fleet.commands.fleet_file import SCHEMAS, schema_text
 from fleet.examples import EXAMPLES
 from fleet.fleetfile.fleet_file import read_fleet
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from fleet.supervisor.process_state import GATEWAY_GRACE_S
 from fleet.supervisor.shutdown import CAR_LINK_TIMEOUT_S, GATEWAY_START_TIMEOUT_S
 from fleet.supervisor.supervisor import CAR_STOP_RETRY_S, RECORDER_EXIT_TIMEOUT_S, SERVICE_EXIT_TIMEOUT_S
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 
-from fleet.supervisor.restart_policy import GATEWAY_GRACE_S
+from fleet.supervisor.process_state import GATEWAY_GRACE_S
 from fleet.supervisor.supervisor import RECORDER_EXIT_TIMEOUT_S, SERVICE_EXIT_TIMEOUT_S
 from gateway.link.ble import BLE_WRITE_TIMEOUT_S, DISCONNECT_TIMEOUT_S
 from gateway.link.serial import SERIAL_WRITE_TIMEOUT_S

@@ -49,9 +49,9 @@ from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine
 from gateway.drivers.lines import LineSplitter
 from gateway.drivers.plain import UNASKED_LOG_S, PlainDriver
 from gateway.drivers.plain_profile import PlainProfile
-from gateway.drivers.waveshare.chassis import FULL_SPEED, PLATFORMS, Chassis
 from gateway.drivers.waveshare.feedback_parser import Feedback, read_line
 from gateway.drivers.waveshare.firmware import UgvFirmware
+from gateway.drivers.waveshare.ugv_platforms import FULL_SPEED, PLATFORMS, Chassis
 from schemas.words import FrameOrigin, Level, Light, Motion, Motors, Phase, Reason, Shows
 
 DRIVE: Final = 1

@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from gateway.drivers.plain_profile import PlainProfile
-from gateway.drivers.waveshare import chassis
-from gateway.drivers.waveshare.chassis import profile_of
+from gateway.drivers.waveshare import ugv_platforms
+from gateway.drivers.waveshare.ugv_platforms import profile_of
 
 if TYPE_CHECKING:
     from gateway.control.driver import Desk
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["PLATFORMS", "driver_of", "profile_of", "profiles"]
 
-PLATFORMS: Final = tuple(chassis.PLATFORMS)
+PLATFORMS: Final = tuple(ugv_platforms.PLATFORMS)
 
 
 def profiles() -> tuple[PlainProfile, ...]:

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from fleet.cli import cli
 from fleet.console import certificate, network_console
 from fleet.console.certificate import BadKeyFile, ensure_certificate, needs_renewal
-from fleet.console.pairing import PagePerson, PeopleBook
+from fleet.console.people_book import PagePerson, PeopleBook
 from fleet.console.people_file import PeopleFile, people_path
 from schemas.bus import resolve_endpoint
 

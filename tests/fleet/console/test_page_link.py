@@ -5,7 +5,7 @@ import json
 from typing import Any
 
 from fleet.console.page_link import PageLink
-from fleet.console.pairing import PagePerson
+from fleet.console.people_book import PagePerson
 from schemas.words import Rank
 
 

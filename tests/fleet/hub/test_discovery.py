@@ -10,7 +10,8 @@ from click.testing import CliRunner
 
 from fleet.commands.hub import join_hub
 from fleet.hub.discovery import announced, hubs_found
-from fleet.hub.invitation import Invitation, NotJoined, join_one_of
+from fleet.hub.invitation import Invitation
+from fleet.hub.join import NotJoined, join_one_of
 from fleet.hub.join_code import JoinCode
 from schemas.identity import person
 from tests.fleet.hub.test_invitation import made

@@ -13,7 +13,8 @@ import pytest
 
 from fleet.hub.discovery import announced, hubs_found
 from fleet.hub.hub_store import HubStore
-from fleet.hub.invitation import Invitation, NotJoined, join
+from fleet.hub.invitation import Invitation
+from fleet.hub.join import NotJoined, join
 from fleet.hub.join_code import MAX_GUESSES, JoinCode
 from schemas.bus.credentials import Credentials
 from schemas.identity import car, person, site

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from fleet.hub.hub_store import HubStore
-from fleet.hub.invitation import Joined
+from fleet.hub.join import Joined
 from fleet.hub.local_hub import SECURE_ENDPOINT, store_joined
 from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.identity import Service, service

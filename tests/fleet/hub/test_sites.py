@@ -12,7 +12,8 @@ import zenoh
 
 from fleet.hub import certificate_authority
 from fleet.hub.hub_store import HubStore
-from fleet.hub.invitation import Invitation, join
+from fleet.hub.invitation import Invitation
+from fleet.hub.join import join
 from fleet.hub.local_hub import ensure_hub_here, store_joined
 from schemas import identity, keys
 from schemas.bus import Bus, BusError, hub, hub_renewals

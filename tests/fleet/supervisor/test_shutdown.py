@@ -8,8 +8,8 @@ import pytest
 from fleet.client.claims import NOT_CONFIRMED, NOT_STOPPED, STOP_SENT, STOPPED
 from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.log_files import Log
+from fleet.supervisor.process_state import ProcessState
 from fleet.supervisor.processes import ManagedProcess, ProcessSet
-from fleet.supervisor.restart_policy import ProcessState
 from fleet.supervisor.shutdown import LAST_CLAIM_TIMEOUT_S, NEVER_REACHED, GatewayShutdown, describe_end
 from fleet.supervisor.spec import PATIENCE
 from schemas.gen import fleet_v1_pb2 as pb

@@ -18,7 +18,7 @@ from fleet.client.reading import Reading
 from fleet.client.wait import ConditionWait
 from fleet.policy.car_condition import parse_condition
 from fleet.recording.reading.session import Recorded, Session
-from fleet.recording.tools.find import find_in
+from fleet.recording.tools.condition_search import find_in
 from fleet.replay.player.player import Player
 from fleet.replay.player.schedule import Schedule
 from schemas import bus

@@ -8,7 +8,7 @@ import pytest
 
 from gateway.control.commands import AimServo, Drive, EmergencyStop, Led, SetLight, SetMode, Signal, Stop
 from gateway.drivers.waveshare import driver as waveshare
-from gateway.drivers.waveshare.chassis import FULL_SPEED
+from gateway.drivers.waveshare.ugv_platforms import FULL_SPEED
 from gateway.sim.model.ir_remote import Button
 from schemas.commands import Verb
 from schemas.words import Basis, CarTrust, Light, Mode, Motion, Motors, Phase, Reason, Shows

@@ -29,7 +29,7 @@ from fleet.fleetfile.fleet_file import PinRule
 from fleet.policy.car_condition import parse_condition
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SESSION_FILE
-from fleet.recording.tools.find import ConditionRun, find_in
+from fleet.recording.tools.condition_search import ConditionRun, find_in
 from fleet.recording.tools.summary import overview
 from fleet.recording.writing.pin_watch import PinWatch
 from schemas import messages

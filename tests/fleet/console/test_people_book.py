@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from fleet.console import pairing
+from fleet.console import people_book
 from fleet.console.connection_limit import (
     MAX_CONNECTIONS,
     MAX_PER_DEVICE,
@@ -16,10 +16,10 @@ from fleet.console.connection_limit import (
     ConnectionLimit,
     LogLimit,
 )
-from fleet.console.pairing import (
+from fleet.console.guess_limit import GUESS_MEMORY_S, MAX_GUESS_DELAY_S, MAX_GUESSERS, GuessLimit
+from fleet.console.people_book import (
     BadBook,
     ClassFull,
-    GuessLimit,
     NoGuest,
     PagePerson,
     PeopleBook,
@@ -30,7 +30,7 @@ from fleet.console.pairing import (
 from fleet.hub.join_code import CODE_ALPHABET
 
 MIA = PagePerson("mia")
-CODES = st.text(CODE_ALPHABET, min_size=pairing.CODE_LENGTH, max_size=pairing.CODE_LENGTH)
+CODES = st.text(CODE_ALPHABET, min_size=people_book.CODE_LENGTH, max_size=people_book.CODE_LENGTH)
 NOW = 1.8e9
 
 
@@ -45,7 +45,7 @@ def test_pairing_code_is_good_once_within_two_minutes(code: str, other: str, age
     book = PeopleBook().issue(code, MIA, NOW)
     assert (book.redeem(other, "c", "d1", "", NOW) is not None) is (other == code)
     found = book.redeem(code_words(code).lower(), "c", "d1", "", NOW + age_s)
-    assert (found is not None) is (0 <= (NOW + age_s) - NOW < pairing.CODE_LIFETIME_S)
+    assert (found is not None) is (0 <= (NOW + age_s) - NOW < people_book.CODE_LIFETIME_S)
     if found is not None:
         assert found.redeem(code, "c2", "d2", "", NOW + age_s) is None, "a replay"
         assert found.devices[0].person == MIA
@@ -53,12 +53,12 @@ def test_pairing_code_is_good_once_within_two_minutes(code: str, other: str, age
 
 def test_new_pairing_code_keeps_other_and_old_ones_expire() -> None:
     book = PeopleBook()
-    for number in range(pairing.MAX_CODES + 3):
+    for number in range(people_book.MAX_CODES + 3):
         book = book.issue(f"CODE{number:04}", MIA, NOW)
-    assert len(book.codes) == pairing.MAX_CODES
+    assert len(book.codes) == people_book.MAX_CODES
     assert book.redeem("CODE0000", "c", "d", "", NOW) is None
     assert book.redeem("CODE0007", "c", "d", "", NOW) is not None
-    assert len(book.issue("LATER234", MIA, NOW + pairing.CODE_LIFETIME_S).codes) == 1
+    assert len(book.issue("LATER234", MIA, NOW + people_book.CODE_LIFETIME_S).codes) == 1
 
 
 @pytest.mark.parametrize("person", [PagePerson("Mia M"), PagePerson(""), PagePerson("mia", "king"), PagePerson("a/b")])
@@ -148,8 +148,8 @@ def test_class_code_pairs_guests_for_ten_minutes_until_closed() -> None:
     assert [each.person.name for each in book.guests(NOW + 5)] == ["guest-1", "guest-2", "guest-3"]
     assert PeopleBook.of_text(book.as_text()) == book
     assert CLASS not in book.as_text()
-    assert join(book, 9, NOW + pairing.CLASS_LIFETIME_S - 1) is not None
-    assert join(book, 9, NOW + pairing.CLASS_LIFETIME_S) is None
+    assert join(book, 9, NOW + people_book.CLASS_LIFETIME_S - 1) is not None
+    assert join(book, 9, NOW + people_book.CLASS_LIFETIME_S) is None
     assert join(book, 9, NOW - 1) is None, "a clock that was set back ends it"
     assert join(book.close_class(), 9) is None
     assert join(book.open_class("OTHER234", NOW), 9) is None, "a new one ends the one before"
@@ -159,7 +159,7 @@ def test_class_code_pairs_guests_for_ten_minutes_until_closed() -> None:
 
 def test_thousand_guests_are_one_class_and_displace_nobody() -> None:
     book = PeopleBook()
-    for number in range(pairing.MAX_DEVICES - 10):
+    for number in range(people_book.MAX_DEVICES - 10):
         book = book.issue(f"CODE{number:04}", MIA, NOW)
         book = book.redeem(f"CODE{number:04}", f"own{number}", f"own{number}", "", NOW) or book
     persons = book.devices
@@ -176,7 +176,7 @@ def test_thousand_guests_are_one_class_and_displace_nobody() -> None:
     for number in range(1000):
         with suppress(ClassFull):
             book = join(book, number) or book
-    assert len(book.guests(NOW)) == pairing.MAX_GUESTS
+    assert len(book.guests(NOW)) == people_book.MAX_GUESTS
     names = [each.person.name for each in book.guests(NOW)]
     assert len(set(names)) == len(names)
 
@@ -206,7 +206,7 @@ def test_guest_becomes_person_once_and_is_listed() -> None:
         with pytest.raises(NoGuest):
             gone.assign("id1", MIA, later)
     with pytest.raises(NoGuest):
-        book.assign("id1", MIA, NOW + pairing.GUEST_LIFETIME_S)
+        book.assign("id1", MIA, NOW + people_book.GUEST_LIFETIME_S)
     with pytest.raises(NoGuest):
         replace(paired(), people=("mia",)).assign("d1", MIA, NOW)  # a person stays who they are
     with pytest.raises(ValueError, match="guest"):
@@ -244,18 +244,18 @@ def test_waits_grow_up_to_a_limit_and_are_forgotten(pauses: list[int]) -> None:
         now += pause
         limit.on_wrong("a", now)
         wait = limit.wait_s("a", now)
-        assert before <= wait <= pairing.MAX_GUESS_DELAY_S
+        assert before <= wait <= MAX_GUESS_DELAY_S
         before = wait
-    assert limit.wait_s("a", now + pairing.GUESS_MEMORY_S) == 0
+    assert limit.wait_s("a", now + GUESS_MEMORY_S) == 0
     limit.on_right("a")
     assert limit.wait_s("a", now) == 0
 
 
 def test_memory_of_guesses_is_bounded() -> None:
     limit = GuessLimit()
-    for number in range(pairing.MAX_GUESSERS + 50):
+    for number in range(MAX_GUESSERS + 50):
         limit.on_wrong(str(number), 0.0)
-    assert len(limit._guessers) == pairing.MAX_GUESSERS
+    assert len(limit._guessers) == MAX_GUESSERS
 
 
 def test_codes_have_no_letters_that_are_confused() -> None:

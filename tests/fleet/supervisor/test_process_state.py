@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet.supervisor.restart_policy import (
+from fleet.supervisor.process_state import (
     FIRST_RESTART_DELAY_S,
     GATEWAY_GRACE_S,
     MAX_RESTART_DELAY_S,
