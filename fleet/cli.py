@@ -5,7 +5,6 @@ Subcommands are imported when they are called, so that `fleet --help` is fast.
 
 import importlib
 import os
-import re
 import sys
 from typing import Final
 
@@ -13,10 +12,10 @@ import click
 from click.shell_completion import BashComplete, FishComplete, add_completion_class
 
 from fleet.commands.command_group import CommandGroup, as_option, connect_option, fleet_option
+from fleet.usage_errors import command_path, describe_missing_package, describe_error
 from schemas import commands
 from schemas.printable import printable_lines
 from schemas.process import startup, stdio
-from schemas.suggestion import how_to_install, misspelled
 
 
 def _plain_commands(section: str) -> dict[str, tuple[str, str]]:
@@ -225,16 +224,18 @@ def main() -> None:
         error.show()
         code = 2
     except click.UsageError as error:
-        sys.stderr.write(f"fleet: {printable_lines(_one_line(error))} (see {_command_path(error)} --help)\n")
+        words = printable_lines(describe_error(error, cli))
+        sys.stderr.write(f"fleet: {words} (see {command_path(error, cli)} --help)\n")
         code = error.exit_code
     except click.ClickException as error:
         own_form = getattr(error, "own_form", False) or "\n" in error.message
-        sys.stderr.write(f"{error.message}\n" if own_form else f"fleet: {printable_lines(_one_line(error))}\n")
+        words = error.message if own_form else f"fleet: {printable_lines(describe_error(error, cli))}"
+        sys.stderr.write(f"{words}\n")
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = startup.INTERRUPTED
     except ModuleNotFoundError as error:
-        sys.stderr.write(f"fleet: {_missing(error)}\n")
+        sys.stderr.write(f"fleet: {describe_missing_package(error, _EXTRAS)}\n")
         code = 1
     except RuntimeError as error:
         # Python's locks raise this error ("release unlocked lock") if Ctrl-C comes while a wait ends.
@@ -248,57 +249,6 @@ def main() -> None:
     except OSError as error:
         code = stdio.silence_broken(error, "fleet")
     sys.exit(code)
-
-
-def _missing(error: ModuleNotFoundError) -> str:
-    """Return a message about the missing package and how to install it.
-
-    Raises the error again if the module is our own.
-    """
-    module = (error.name or "").partition(".")[0]
-    if module in ("", "fleet", "gateway", "schemas"):
-        raise error
-    how = how_to_install(_EXTRAS[module]) if module in _EXTRAS else "pip install zenoh-car-fleet"
-    return f"this command needs {module}, which is not installed. Type: {how}"
-
-
-def _command_path(error: click.UsageError) -> str:
-    """Return the command that the error is about.
-
-    Errors of click's parser do not contain it, so find it in the arguments.
-    """
-    if error.ctx is not None:
-        return error.ctx.command_path
-    path: list[str] = ["fleet"]
-    command: click.Group = cli
-    for word in sys.argv[1:]:
-        found = command.get_command(click.Context(command), word)
-        if found is not None:
-            path.append(word)
-            if not isinstance(found, click.Group):
-                break
-            command = found
-    return " ".join(path)
-
-
-def _one_line(error: click.ClickException) -> str:
-    """Return the message on one line.
-
-    The messages of our own parameter types already quote the wrong word, so the name of the argument is left out.
-    """
-    if isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter):
-        option = f"{error.param.opts[-1]}: " if isinstance(error.param, click.Option) else ""
-        return " ".join(f"{option}{error.message}".split())
-    if isinstance(error, click.NoSuchOption) and error.ctx is not None:
-        # click also suggests names that are hardly similar, such as --as for --json.
-        options = [each for param in error.ctx.command.get_params(error.ctx) for each in param.opts]
-        near = misspelled(error.option_name.lstrip("-"), [each[2:] for each in options if each.startswith("--")])
-        return f"No such option '{error.option_name}'.{f' Did you mean --{near[0]}?' if near else ''}"
-    words = " ".join(error.format_message().split())
-    extra = re.fullmatch(r"Got unexpected extra arguments? \((.*)\)", words)
-    if extra is None or not isinstance(error, click.UsageError):
-        return words
-    return f'{_command_path(error)} does not accept "{extra[1]}".'
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from gateway.bus.revocation_watch import RevocationWatch
 from gateway.control.battery import BatteryPolicy
 from gateway.control.controller import Controller
 from gateway.control.driver import TICK_S
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from gateway.learned_file import LearnedFile
 from gateway.link import LinkError, LinkUrl
 from gateway.link_loop import LinkLoop, at_rate

@@ -13,7 +13,7 @@ from typing import Any, Final
 from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from schemas.atomic_file import DAMAGE, write_state
 from schemas.process.stdio import printable
 from schemas.rights import Estop, FleetPause, Hold, Loan

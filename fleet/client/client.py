@@ -42,9 +42,9 @@ from fleet.client.commands import (
     stop_request,
 )
 from fleet.client.condition import KeyCondition, check_car, check_key
+from fleet.client.hub_ended import explain_no_fleet
 from fleet.client.job_threads import JobThreads
 from fleet.client.lease import Lease
-from fleet.client.lost_hub import explain_no_fleet
 from fleet.client.outcome import OVERLOAD_ANSWER_TIMEOUT_S, Outcome, Until
 from fleet.client.pose import pose_message
 from fleet.client.reading import Reading, Watch, reading_of

@@ -12,7 +12,7 @@ from click.shell_completion import CompletionItem
 
 from fleet.client.client import Fleet
 from fleet.client.condition import topics_under
-from fleet.client.lost_hub import describe_running
+from fleet.client.hub_ended import describe_running
 from fleet.client.refused_by_hub import why_refused
 from fleet.client.supervision import ask_status, fleets_on, groups_of
 from fleet.commands.params import describe_usage

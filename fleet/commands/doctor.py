@@ -12,10 +12,10 @@ from fleet.client.diagnosis import CarEvidence, DoctorFinding, as_dict, describe
 from fleet.client.refused_by_hub import why_refused
 from fleet.commands.car_names import complete_car, no_cars
 from fleet.commands.command_group import hint_options, say
-from fleet.commands.fleets import open_client
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.output import echo_safely, with_progress
 from fleet.commands.params import SessionPath
+from fleet.commands.which_fleet import open_client
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import is_session
 from fleet.recording.tools.session_findings import SessionCheckup

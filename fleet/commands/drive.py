@@ -19,13 +19,13 @@ from fleet.client.commands import (
     resume_request,
     stop_request,
 )
-from fleet.client.lost_hub import LostHub
+from fleet.client.hub_ended import LostHub
 from fleet.client.outcome import NO_ANSWER, Outcome, bus_lost_words
 from fleet.commands.car_names import ALL_CARS, any_cars_argument, cars_argument, resolve_cars, stopped_cars_argument
 from fleet.commands.exit_code import carry_out, end_with, print_outcomes
-from fleet.commands.fleets import client_in, stop_in_all_fleets
 from fleet.commands.options import bus_options, json_option, take_option, with_client
 from fleet.commands.params import Choice, Duration
+from fleet.commands.which_fleet import client_in, stop_in_all_fleets
 from schemas import keys
 from schemas.bus import BusError, HubUnreachable, NoFleet
 from schemas.process import signals, startup

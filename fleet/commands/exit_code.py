@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from fleet.client.client import Fleet
 from fleet.client.commands import CommandRequest
 from fleet.client.hints import complete_hints
-from fleet.client.lost_hub import describe_running, explain_no_fleet
+from fleet.client.hub_ended import describe_running, explain_no_fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
 from fleet.client.refused_by_hub import why_refused
 from fleet.commands.car_names import describe_other_fleets, no_cars, resolve_cars

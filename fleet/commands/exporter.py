@@ -6,8 +6,8 @@ import threading
 
 import click
 
-from fleet.commands.fleets import open_observer
 from fleet.commands.options import bus_options, serving_options
+from fleet.commands.which_fleet import open_observer
 from fleet.exporter.dashboard import dashboard
 from fleet.exporter.exporter import DEFAULT_EXPORTER_PORT, Exporter
 from schemas.process import signals

@@ -7,9 +7,9 @@ from typing import Final
 import click
 
 from fleet.bridges.foxglove_server import DEFAULT_FOXGLOVE_PORT, FoxgloveServer, PortInUse, layout_now
-from fleet.commands.fleets import open_observer
 from fleet.commands.options import bus_options, serving_options
 from fleet.commands.output import echo_safely
+from fleet.commands.which_fleet import open_observer
 from schemas.process import signals
 
 _FOXGLOVE_INTERVAL_S: Final = 0.02

@@ -17,9 +17,9 @@ from fleet.client.services import ask_recorder
 from fleet.client.supervision import SUPERVISOR_STATUS, ask_status
 from fleet.commands.command_group import chosen_person, say
 from fleet.commands.exit_code import not_running
-from fleet.commands.fleets import client_in, the_fleet
 from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option
+from fleet.commands.which_fleet import client_in, the_fleet
 from fleet.supervisor.log_files import parse_log_line, runs_directory
 from fleet.supervisor.supervisor_service import ask_service
 from schemas import keys, messages

@@ -12,9 +12,9 @@ import click
 
 from fleet.bridges.home_assistant import DISCOVERY_PREFIX, HomeAssistant
 from fleet.bridges.mqtt_bridge import PLAIN_PORT, TLS_PORT, Broker, BrokerRefused, MqttBridge
-from fleet.commands.fleets import open_observer
 from fleet.commands.options import bus_options
 from fleet.commands.output import echo_safely
+from fleet.commands.which_fleet import open_observer
 
 PASSWORD_VARIABLE: Final = "FLEET_MQTT_PASSWORD"  # noqa: S105 - the name of the variable
 """The password is not an option, because everybody on this computer can read a command line."""

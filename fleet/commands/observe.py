@@ -30,11 +30,11 @@ from fleet.commands.car_names import (
     warn_if_missing,
 )
 from fleet.commands.command_group import say
-from fleet.commands.fleets import open_client, open_observer
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.output import json_text, reading_line, show_table
 from fleet.commands.params import Duration, Number, Since
 from fleet.commands.ready import READY_WAIT_S, wait_ready
+from fleet.commands.which_fleet import open_client, open_observer
 from fleet.recording.tools import csv_table
 from schemas import keys, topics
 from schemas.bus import Sample, intersects

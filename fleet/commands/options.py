@@ -9,8 +9,8 @@ import click
 from fleet.commands.car_names import complete_people
 from fleet.commands.command_group import as_option, choose_fleet, connect_option, fleet_option
 from fleet.commands.exit_code import cli_errors
-from fleet.commands.fleets import open_client
 from fleet.commands.params import Number
+from fleet.commands.which_fleet import open_client
 from schemas.bus import LOOPBACK
 
 _Function = Callable[..., Any]

@@ -20,9 +20,9 @@ from fleet.client.services import NO_PLAN, ask_coordinator
 from fleet.commands.car_names import complete_car
 from fleet.commands.command_group import CommandGroup, say
 from fleet.commands.exit_code import WrongFile
-from fleet.commands.fleets import open_client
 from fleet.commands.options import bus_options, json_option, with_client
 from fleet.commands.params import SessionPath
+from fleet.commands.which_fleet import open_client
 from fleet.policy.plan_requests import PlanRequest
 from schemas import keys
 from schemas.bus import Failure

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from fleet.policy.plan.plan import Plan
     from fleet.policy.snapshot import CarSnapshot
     from fleet.recording.reading.session import Session
+    from fleet.replay.analysis.decision_differences import DecisionDifference
     from fleet.replay.analysis.recorded_decisions import (
         CoordinatorRun,
-        DecisionDifference,
         PresenceToken,
         RecordedDecision,
     )
@@ -163,7 +163,7 @@ class _ReplanReport:
             )
 
     def _compare_run(self, run: "CoordinatorRun", again: "Replanning", tokens: "list[PresenceToken]") -> Any:
-        from fleet.replay.analysis.recorded_decisions import differences
+        from fleet.replay.analysis.decision_differences import differences
         from fleet.replay.analysis.replan import COORDINATOR_HISTORY_NS, keys_for
 
         expressions = keys_for(run.fleet, (plan for _, plan in again.plans))

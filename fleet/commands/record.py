@@ -18,10 +18,10 @@ from fleet.commands.command_group import (
     say,
     starter_option,
 )
-from fleet.commands.fleets import the_fleet
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.output import echo_safely
 from fleet.commands.params import Choice, Duration
+from fleet.commands.which_fleet import the_fleet
 from fleet.quota import Quota, parse_size
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from fleet.recording.writing.disk_space import Reserve

@@ -35,7 +35,7 @@ log = logging.getLogger("fleet")
 
 
 class LimitedListener(socket.socket):
-    """A listening socket, and its connections that have begun TLS. `entrance` accepts them."""
+    """A listening socket, and its connections that have begun TLS. `tls_entrance` accepts them."""
 
     limit: ConnectionLimit
     _accepted: dict[Hashable, socket.socket]

@@ -9,11 +9,11 @@ from typing import Any, Final
 from msgspec import Struct, field
 
 from fleet.coordinator.observer import FleetObserver
-from fleet.policy.difference import plan_changes
 from fleet.policy.lint.lint import PlanFault, find_faults
 from fleet.policy.plan.plan import Plan
 from fleet.policy.plan.plan_model import PlanEntry
 from fleet.policy.plan.plan_parser import BadPlan, parse, parse_entry
+from fleet.policy.plan_changes import plan_changes
 from fleet.policy.snapshot import CarSnapshot
 from fleet.policy.trial import PlanInForce, Trial, try_plan
 from schemas.bus import Sample

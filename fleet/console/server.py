@@ -26,7 +26,6 @@ from fleet.aio import Fleet
 from fleet.client.commands import stop_request
 from fleet.console.budgets import TOO_MANY_PLANS, TOO_MUCH, page_budget
 from fleet.console.console import Console, TooManyPages
-from fleet.console.entrance import Entrance
 from fleet.console.fair_socket import FairWebSocket
 from fleet.console.log_rate import LogRate
 from fleet.console.page_requests import is_stop
@@ -35,6 +34,7 @@ from fleet.console.people_routes import pair_routes, people_routes
 from fleet.console.plan_view import plan_name
 from fleet.console.request_body import read_text
 from fleet.console.request_filter import DEVICE, PERSON, STOP_PATH, App, Guard, NetworkGuard, Receive, Scope, Send
+from fleet.console.tls_entrance import Entrance
 from fleet.console.worker import TooManyQuestions
 from fleet.examples import EXAMPLES
 from schemas.bus import LARGEST_PAYLOAD, LOOPBACK, BusError
@@ -201,8 +201,8 @@ async def serve(
         each.add_done_callback(end)
     try:
         on_ready()
-        # Imported objects live as long as the process. Freeze them, so that the garbage collections of `entrance` skip
-        # them.
+        # Imported objects live as long as the process. Freeze them, so that the garbage collections of `tls_entrance`
+        # skip them.
         gc.collect()
         gc.freeze()
         await asyncio.gather(*(server.serve(sockets=[listens]) for server, listens in servers))

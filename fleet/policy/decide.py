@@ -6,15 +6,15 @@ people drive. So most of this module is about *not* acting.
 
 First: whose car is it? The coordinator has the lowest rank. A car is left alone, whatever the plan says, if a person
 holds, drives, has paused or borrowed it, if an e-stop is in force, or if it cannot be reached or is not in a known
-state. This module calls such a reason a *barrier*. Each barrier has a sentence for the person who asks why nothing
+state. Such a reason is a *barrier* (`barriers`). Each barrier has a sentence for the person who asks why nothing
 happens. A car that is out of reach keeps its role for a while, because links come back within seconds. A role that
 nobody carries out for a moment is better than a fleet whose roles change at every short loss of a link.
 
 Second: what is true? Rules are evaluated in every step. A rule comes into force when its condition has been true for
 the time that the plan wants. It ends when the condition has not been true for a time or, if it has an `until`, when
-that is true (`debounce`, `rules`). A comparison with a value
-that was not measured is unknown, and unknown does not count as true: no rule begins because of something that nobody
-has seen.
+that is true (`debounce`, `rules_in_force`). A comparison with a value that was not measured is unknown, and unknown
+does not count as true: no rule begins because of something that nobody has seen. `rule_effects` has what the rules in
+force do.
 
 Third: who gets which role? That is a small assignment problem (`role_allocation`). Filled roles of high priority count
 most, then cars that keep their role, then few changes of mode. A car may be replaced if it has twice failed to change
@@ -26,15 +26,15 @@ next is in `memory`, and time is an argument. So the same plan, snapshot and mem
 dry run, and in a replay of yesterday's recording that asks what another plan would have done.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from msgspec import Struct, field
 from msgspec.structs import replace
 
+from fleet.policy.barriers import find_barriers, has_no_state, is_recovering
 from fleet.policy.decision import Decision, DecisionKind
 from fleet.policy.explain import (
-    Override,
     explain_alone,
     explain_contradiction,
     explain_filled,
@@ -51,18 +51,18 @@ from fleet.policy.explain import (
     is_reworded,
 )
 from fleet.policy.phases import follow_phase
-from fleet.policy.plan.plan import Effect, Plan, Rule
+from fleet.policy.plan.plan import Plan
 from fleet.policy.role_allocation import (
     ROLE_KEPT_S,
     Barrier,
     Candidates,
-    PinnedRole,
     RoleAllocation,
     allocate,
     follow_needs,
     reserved_roles,
 )
-from fleet.policy.rules import CarSets, RuleState, follow_rules, targets
+from fleet.policy.rule_effects import effects_in_force, overrides, pinned_roles, targets
+from fleet.policy.rules_in_force import CarSets, RuleState, follow_rules
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import (
     HUB_RETURN_GRACE_S,
@@ -74,8 +74,7 @@ from fleet.policy.state import (
     PolicyState,
 )
 from schemas.colors import COLORS, Rgb
-from schemas.keys import name_of
-from schemas.words import UNKNOWN, LinkState, Mode, Motors, Verdict
+from schemas.words import UNKNOWN, LinkState, Mode, Verdict
 
 FIRST_STATE_TIMEOUT_S: Final = 1.5
 """Timeout for the first states of the cars on the bus. The first roles wait for these states."""
@@ -115,7 +114,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     started_at = now if memory.started_at is None else memory.started_at
     memory = replace(memory, started_at=started_at)
     subjects = _cars_of(plan, snapshot)
-    barriers = _find_barriers(subjects, snapshot)
+    barriers = find_barriers(subjects, snapshot)
     if memory.stopped_by:
         return _step_stopped(plan, snapshot, subjects, barriers, memory, now)
     gone_since = {car: memory.gone_since.get(car, now) for car in barriers}
@@ -135,7 +134,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     reusable = memory.decisions if phase.name == memory.phase.name else {}
     memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
     if now - started_at < FIRST_STATE_TIMEOUT_S and any(
-        _has_no_state(snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects
+        has_no_state(snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects
     ):
         return DecisionStep(memory)
 
@@ -149,14 +148,14 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
         unresponsive=frozenset(
             car for car, attempts in memory.mode_attempts.items() if attempts.count >= ATTEMPTS_BEFORE_REPLACEMENT
         ),
-        pinned=_pinned(plan, rules, subjects),
+        pinned=pinned_roles(plan, rules, subjects),
         in_force=frozenset(plan.roles) if roles_in_force is None else roles_in_force,
         needs=needs,
         now=now,
     )
     allocation = allocate(candidates)
     held_roles = _keep_roles(candidates, allocation, memory.held_roles, barriers)
-    overrides = _overrides(plan, snapshot, rules, subjects, allocation.roles, candidates.pinned)
+    overriding = overrides(plan, snapshot, rules, subjects, allocation.roles, candidates.pinned)
     decisions = [explain_phase(plan, phase, snapshot)] if phase.name else []
     for car in subjects:
         if car in barriers:
@@ -164,8 +163,8 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
             # HUB_RETURN_GRACE_S.
             kept_s = ROLE_KEPT_S if gone_since[car] <= now else HUB_RETURN_GRACE_S
             decisions.append(explain_alone(car, barriers[car], reserved.get(car), kept_s))
-        elif car in overrides:
-            decisions.append(explain_rule(car, overrides[car], allocation.roles.get(car)))
+        elif car in overriding:
+            decisions.append(explain_rule(car, overriding[car], allocation.roles.get(car)))
         elif car in held_roles:
             decisions.append(explain_role(car, held_roles[car], candidates, allocation, phase.name, reusable.get(car)))
         else:
@@ -247,14 +246,6 @@ def _cars_of(plan: Plan, snapshot: FleetSnapshot) -> tuple[str, ...]:
     return tuple(sorted({*plan.named_cars, *snapshot.cars})) if plan.is_open else tuple(sorted(plan.named_cars))
 
 
-def _has_no_state(known: CarSnapshot) -> bool:
-    return known.present and not known.mode
-
-
-def _is_recovering(known: CarSnapshot) -> bool:
-    return known.motors == Motors.UNKNOWN and known.verdict != Verdict.CONTRADICTED
-
-
 def _is_ready(
     snapshot: FleetSnapshot, subjects: tuple[str, ...], barriers: Mapping[str, Barrier], memory: PolicyState
 ) -> bool:
@@ -273,10 +264,10 @@ def _is_ready(
 
 def _may_be_free_soon(known: CarSnapshot, barrier: Barrier) -> bool:
     """Return True if this barrier should end by itself: the first state or the first reading of the car is missing."""
-    if _has_no_state(known):
+    if has_no_state(known):
         return True
     is_reachable = known.present and known.link != LinkState.LOST and not known.doubted
-    return is_reachable and not barrier.ends_role and _is_recovering(known)
+    return is_reachable and not barrier.ends_role and is_recovering(known)
 
 
 def _is_in_decided_mode(known: CarSnapshot, last: Decision | None) -> bool:
@@ -284,99 +275,6 @@ def _is_in_decided_mode(known: CarSnapshot, last: Decision | None) -> bool:
     if last is None or last.kind is DecisionKind.ALONE:  # until this step, the plan could not command this car
         return False
     return last.mode is None or (known.mode == last.mode and known.verdict != Verdict.CONTRADICTED and not known.busy)
-
-
-def _find_barriers(subjects: tuple[str, ...], snapshot: FleetSnapshot) -> dict[str, Barrier]:
-    """Return the cars that are left alone, and why."""
-    found = {car: _find_barrier(car, snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects}
-    return {car: barrier for car, barrier in found.items() if barrier is not None}
-
-
-def _find_barrier(car: str, known: CarSnapshot) -> Barrier | None:
-    """Return why the car is left alone. None if it is not."""
-    if not known.present:
-        return Barrier(f"{car} is not on the bus", "its gateway comes up")
-    if not known.mode:  # without a state, a hold is not known either
-        return Barrier(f"{car} has published no state yet", "its gateway publishes its first states")
-    if known.estopped_by is not None:
-        return Barrier(
-            f"{car} is e-stopped by {name_of(known.estopped_by)}",
-            f"a person or script ends it (`fleet resume {car} --estops`)",
-            ends_role=True,
-        )
-    if known.paused_by is not None:
-        return Barrier(
-            f"{car} is paused with the whole fleet by {name_of(known.paused_by)}",
-            "somebody ends it (`fleet unpause`)",
-            ends_role=True,
-        )
-    if known.lent_to is not None:
-        return Barrier(f"{car} is lent to {known.lent_to}", f"the loan ends (`fleet lend {car} --end`)", ends_role=True)
-    if known.held_by is not None:
-        return Barrier(
-            f"{car} is on hold by {name_of(known.held_by)}",
-            f"a person or script drives it, gives it a mode, or resumes it (`fleet resume {car}`)",
-            ends_role=True,
-        )
-    if known.driven_by is not None:
-        return Barrier(f"{car} is driven by {name_of(known.driven_by)}", "that drive ends")
-    if known.link == LinkState.LOST:
-        return Barrier(f"the link of {car} is lost", "its link is back")
-    if known.doubted:  # people may command the car, because they see what it does
-        ends = (
-            f"it shows a stop (`fleet stop {car}`), or a person who has looked at it resumes it (`fleet resume {car}`)"
-        )
-        return Barrier(f"{car} is in doubt: it has not shown its last stop", ends)
-    if _is_recovering(known):
-        return Barrier(f"{car} is not in a known state yet", "its recovery ends: a reading comes from it")
-    return None
-
-
-# ---------------------------------------------------------------------- rules
-
-
-def _effects_in_force(plan: Plan, rules: Mapping[int, RuleState]) -> Iterator[tuple[int, Rule, RuleState, Effect]]:
-    for index, state in rules.items():
-        if state.on:
-            rule = plan.rules[index]
-            for effect in rule.effects:
-                yield index, rule, state, effect
-
-
-def _pinned(plan: Plan, rules: Mapping[int, RuleState], subjects: tuple[str, ...]) -> dict[str, PinnedRole]:
-    """Return the roles that rules pin, by car. If several rules pin roles of one car, the first one applies."""
-    result: dict[str, PinnedRole] = {}
-    for _, rule, state, effect in _effects_in_force(plan, rules):
-        if effect.role is not None:
-            for car in targets(effect, state, subjects, {}):  # the parser refuses an effect that gives a role a role
-                result.setdefault(car, PinnedRole(effect.role, rule.name))
-    return result
-
-
-def _overrides(
-    plan: Plan,
-    snapshot: FleetSnapshot,
-    rules: Mapping[int, RuleState],
-    subjects: tuple[str, ...],
-    roles: Mapping[str, str],
-    pinned: Mapping[str, PinnedRole],
-) -> dict[str, Override]:
-    """Return the modes that rules in force give cars, whatever their roles say. The first rule applies.
-
-    A rule skips cars that do not know its mode, or may not be in it. They would refuse it again and again.
-    """
-    result: dict[str, Override] = {}
-    decided: set[str] = set()
-    for _, rule, state, effect in _effects_in_force(plan, rules):
-        if effect.mode is not None:
-            for car in targets(effect, state, subjects, roles):
-                if car not in decided and not snapshot.cars.get(car, UNKNOWN_CAR).lacks(effect.mode):
-                    decided.add(car)
-                    result[car] = Override(rule, state, effect)
-        elif effect.role is not None:
-            # Only the first rule in force counts for a car. If that rule gives a role, no later rule gives a mode.
-            decided |= {car for car in targets(effect, state, subjects, roles) if pinned[car].rule == rule.name}
-    return result
 
 
 # ---------------------------------------------------------------------- roles
@@ -522,7 +420,7 @@ def _command_blinks(
     """Switch each blinking LED when its time is over. Switch it off when it no longer blinks, if the car obeys then."""
     subjects = tuple(sorted({*candidates.free, *candidates.reserved}))
     now, result, commands = candidates.now, dict[str, BlinkState](), list[CarCommand]()
-    for _, _, state, effect in _effects_in_force(plan, rules):
+    for _, _, state, effect in effects_in_force(plan, rules):
         if effect.led is None or effect.blink_s is None:
             continue
         for car in targets(effect, state, subjects, allocation.roles):

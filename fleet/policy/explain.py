@@ -15,7 +15,7 @@ from fleet.policy.lint.reachability import describe_unmeasured
 from fleet.policy.phases import PhaseState
 from fleet.policy.plan.plan import ALL_CARS, OTHER_CARS, THIS_CAR, Effect, Plan, PlanCondition, Quantifier, Role, Rule
 from fleet.policy.role_allocation import Barrier, Candidates, RoleAllocation
-from fleet.policy.rules import RuleState
+from fleet.policy.rules_in_force import RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from fleet.policy.state import HeldRole
 from schemas.keys import name_of

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from fleet.policy.debounce import HYSTERESIS_S, Debounced
 from fleet.policy.plan.plan import Plan, PlanPhase
-from fleet.policy.rules import NO_CARS, CarSets, RuleState, debounce_by_car, readings_used
+from fleet.policy.rules_in_force import NO_CARS, CarSets, RuleState, debounce_by_car, readings_used
 from fleet.policy.snapshot import FleetSnapshot
 
 PHASE_SETTLE_TIMEOUT_S: Final = 15.0

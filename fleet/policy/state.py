@@ -11,7 +11,7 @@ from fleet.policy.decision import Decision
 from fleet.policy.phases import PhaseState
 from fleet.policy.plan.plan import Plan
 from fleet.policy.role_allocation import ROLE_KEPT_S
-from fleet.policy.rules import RuleState
+from fleet.policy.rules_in_force import RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
 from schemas.backoff import backoff_s
 from schemas.colors import Rgb

@@ -18,7 +18,7 @@ from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resu
 from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import json_log

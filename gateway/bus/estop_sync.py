@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from gateway.bus.command_parser import MAX_NAME_LENGTH
 from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from schemas import bus, keys, messages
 from schemas.backoff import backoff_s
 from schemas.commands import COMMANDS

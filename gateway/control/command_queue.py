@@ -10,8 +10,8 @@ from typing import Any
 
 from msgspec import Struct, field
 
-from gateway.control.command_log import CommandLog, Pending
-from gateway.control.holds_and_leases import Safety
+from gateway.control.command_records import CommandLog, Pending
+from gateway.control.safety_state import Safety
 from gateway.control.sender_presence import Senders
 from schemas.limits import MAX_QUEUE_TIME_S
 from schemas.rights import Sender

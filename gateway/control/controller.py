@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from gateway.control import refusals
 from gateway.control.battery import BatteryPolicy
-from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue, HeldMotion
+from gateway.control.command_records import CommandLog, Pending
 from gateway.control.commands import (
     Action,
     Answer,
@@ -33,7 +33,7 @@ from gateway.control.commands import (
 )
 from gateway.control.control_output import Record
 from gateway.control.driver import LATE_DRIVE_S, Desk, Driver
-from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
+from gateway.control.safety_state import LEASE_S, PersistedSafety, Safety
 from gateway.control.sender_presence import Senders
 from schemas.keys import name_of
 from schemas.limits import MAX_QUEUE_TIME_S

@@ -19,8 +19,8 @@ from typing import Any, Final, Protocol
 from msgspec import Struct, field
 
 from gateway.control.battery import Battery, BatteryPolicy
-from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue
+from gateway.control.command_records import CommandLog, Pending
 from gateway.control.commands import Action, Signal
 from gateway.control.control_output import OutgoingFrame
 from gateway.control.trust import TrustEvent, TrustState

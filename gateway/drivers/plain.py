@@ -20,8 +20,8 @@ from typing import ClassVar, Final
 from msgspec import Struct, field
 
 from gateway.control.battery import Battery
-from gateway.control.command_log import Pending
 from gateway.control.command_queue import HeldMotion
+from gateway.control.command_records import Pending
 from gateway.control.commands import Action, ChangeSpeed, Find, PartAction, SetMode
 from gateway.control.control_output import Later, OutgoingFrame
 from gateway.control.driver import (

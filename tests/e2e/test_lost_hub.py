@@ -10,7 +10,7 @@ import pytest
 
 from fleet.client.claims import NOT_STOPPED
 from fleet.client.client import Fleet as Client
-from fleet.client.lost_hub import LostHub
+from fleet.client.hub_ended import LostHub
 from schemas.bus import NoFleet, accepts
 from schemas.running_cars import running_cars
 from tests.support.ports import free_endpoint

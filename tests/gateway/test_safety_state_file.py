@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from gateway.safety_state_file import MAX_OTHER_LINKS, SafetyStateFile
 from schemas.links import car_link, parse_link
 from schemas.rights import Estop, FleetPause, Hold, Loan

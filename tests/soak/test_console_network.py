@@ -155,7 +155,7 @@ def test_from_another_computer_nothing_is_served_without_pairing(namespace: str,
         victim = NetworkDevice(wire.port)
         # The browser takes the attacker's port for the console's own.
         victim.origin = f"https://127.0.0.1:{port}"
-        environment = fleet.environment | os.environ
+        environment = os.environ | fleet.environment
         words = [sys.executable, "-m", "fleet.cli", "console", "pair", "victim"]
         made = subprocess.run(words, env=environment, capture_output=True, text=True, check=True, cwd=ROOT).stdout
         fresh = made.split(" type ")[1][:9]

@@ -33,7 +33,7 @@ FORMS: Final = (
     "builtins.Query",  # Zenoh's
     "gateway.bus.car_service.Request",
     "gateway.control.commands.Command",
-    "gateway.control.command_log.Pending",
+    "gateway.control.command_records.Pending",
     "gateway.drivers.yahboom.stops.stop_in_progress.StopInProgress",
     "gateway.control.control_output.OutgoingFrame",
     "gateway.control.control_output.CommandRecord",

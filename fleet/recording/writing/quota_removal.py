@@ -55,7 +55,7 @@ def enforce(quota: Quota, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> E
     if not over:
         return done
     infos = {path: info for path in paths if (info := SessionInfo.read(path)) is not None}
-    spans = _spans(infos, keep, pins)
+    spans = _pinned_times(infos, keep, pins)
     stored = [
         _stored(path, info, spans[info.fleet]) for path, info in infos.items() if path != keep and _may_go(path, info)
     ]
@@ -69,7 +69,7 @@ def enforce(quota: Quota, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> E
     return done
 
 
-def _spans(infos: Mapping[Path, SessionInfo], keep: Path, pins: Iterable[Pin]) -> dict[str, Spans]:
+def _pinned_times(infos: Mapping[Path, SessionInfo], keep: Path, pins: Iterable[Pin]) -> dict[str, Spans]:
     """Return the pinned times of each fleet."""
     times: dict[str, list[tuple[int, int]]] = {}
     for path, info in infos.items():

@@ -42,7 +42,7 @@ from collections.abc import Mapping
 from enum import Enum, auto
 from typing import Any, ClassVar, Final
 
-from gateway.control.command_log import Pending
+from gateway.control.command_records import Pending
 from gateway.control.commands import Action, Drive, Find, SetLight
 from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import Desk, Echo, Event, Fields, Findings, TextLine

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gateway.control.battery import Battery, BatteryPolicy
-from gateway.control.command_log import CommandLog
+from gateway.control.command_records import CommandLog
 from gateway.control.driver import Findings, Outputs, describe_distance_change, learn_trust
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from gateway.drivers.yahboom.estimate.learned import Learned

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from gateway.control.command_log import CommandLog
+from gateway.control.command_records import CommandLog
 from gateway.control.commands import SetMode
 from gateway.control.driver import Rejected
 from gateway.control.trust import STOP_GOES_ON, TrustEvent

@@ -7,8 +7,8 @@ frame may be written.
 from collections import deque
 from typing import Final
 
-from gateway.control.command_log import Pending
 from gateway.control.command_queue import HeldMotion
+from gateway.control.command_records import Pending
 from gateway.control.commands import Fan, SetMode
 from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import TICK_S, Desk, Driver

@@ -5,7 +5,7 @@
 
 from typing import Final
 
-from gateway.control.command_log import CommandLog, Pending
+from gateway.control.command_records import CommandLog, Pending
 from gateway.control.commands import SetMode
 from gateway.control.driver import log_unstopped
 from gateway.control.trust import STOP_GOES_ON, TrustEvent

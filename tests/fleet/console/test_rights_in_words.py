@@ -23,7 +23,7 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.holds_and_leases import Safety
+from gateway.control.safety_state import Safety
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Right, Sender
 from schemas.words import Light, Mode, Motion, Rank, SpeedStep

@@ -3,8 +3,8 @@
 import pytest
 from msgspec.structs import replace
 
-from fleet.policy.difference import plan_changes
 from fleet.policy.plan.plan_parser import parse
+from fleet.policy.plan_changes import plan_changes
 from fleet.policy.snapshot import FleetSnapshot
 from fleet.policy.trial import PlanInForce, try_plan
 from tests.fleet.policy.cars import HERE, PolicyRun

@@ -9,7 +9,7 @@ import zenoh
 
 from gateway.bus import estop_sync
 from gateway.bus.estop_sync import MAX_SINGLE_QUERIES, EstopSync
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from schemas.bus import Bus, Handover, reply
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.messages import encoding_of

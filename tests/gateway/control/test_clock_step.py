@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gateway.bus.car_service import Request
 from gateway.bus.command_parser import parse
 from gateway.control.commands import Answer
-from gateway.control.holds_and_leases import LEASE_S, PersistedSafety, Safety
+from gateway.control.safety_state import LEASE_S, PersistedSafety, Safety
 from schemas import messages
 from schemas.commands import COMMANDS
 from schemas.rights import Loan

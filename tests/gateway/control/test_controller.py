@@ -25,7 +25,7 @@ from gateway.control.commands import (
     Signal,
     Stop,
 )
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from gateway.drivers.yahboom.protocol.frames import ModeOpen, parse_sent
 from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.drivers.yahboom.stops import cases

@@ -22,8 +22,8 @@ from gateway.control.commands import (
     TakeLease,
     Unpause,
 )
-from gateway.control.holds_and_leases import PersistedSafety
 from gateway.control.refusals import CommandContext, refuse
+from gateway.control.safety_state import PersistedSafety
 from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Hold, LeaseState, Loan, People, Sender
 from schemas.words import Mode, Motion, Phase, Rank, Reason
 from tests.gateway.control.workbench import RUN, SHOWN_STOP, Workbench

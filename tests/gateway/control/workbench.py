@@ -5,7 +5,7 @@ from collections.abc import Callable
 from gateway.control.commands import Action, Answer, Command
 from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.driver import TICK_S
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import Frame, General, ModeClose, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform

@@ -6,12 +6,12 @@ from typing import Any, cast
 
 import pytest
 
-from gateway.control.command_log import CommandLog, Pending
 from gateway.control.command_queue import CommandQueue
+from gateway.control.command_records import CommandLog, Pending
 from gateway.control.commands import Action, Command, Drive, Find, Led, SetLight, SetMode, Signal, Stop
 from gateway.control.control_output import CommandRecord, Later
 from gateway.control.controller import Controller
-from gateway.control.holds_and_leases import PersistedSafety, Safety
+from gateway.control.safety_state import PersistedSafety, Safety
 from gateway.control.sender_presence import Senders
 from gateway.drivers import Family
 from gateway.drivers.check import Bench

@@ -4,7 +4,7 @@ from typing import Final
 
 from msgspec import Struct, field
 
-from gateway.control.command_log import Pending
+from gateway.control.command_records import Pending
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.pacing import FLIGHT_S, Pacing
 from gateway.drivers.yahboom.protocol.frames import Frame, ModeClose

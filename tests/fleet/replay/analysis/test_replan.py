@@ -13,13 +13,12 @@ from fleet.cli import cli
 from fleet.client.client import Fleet
 from fleet.recording import time_spec
 from fleet.recording.reading.session import Recorded, Session
+from fleet.replay.analysis.decision_differences import DecisionDifference, differences
 from fleet.replay.analysis.recorded_decisions import (
-    DecisionDifference,
     PresenceToken,
     RecordedDecision,
     Timeline,
     add,
-    differences,
     presence,
 )
 from schemas import messages

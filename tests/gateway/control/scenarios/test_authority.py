@@ -3,7 +3,7 @@
 import pytest
 
 from gateway.control.commands import Action, ChangeSpeed, Drive, EmergencyStop, Led, Resume, SetMode, Stop, TakeLease
-from gateway.control.holds_and_leases import PersistedSafety
+from gateway.control.safety_state import PersistedSafety
 from schemas.rights import Estop, Sender
 from schemas.words import Mode, Motion, Phase, Rank, Reason, SpeedStep
 from tests.gateway.control.workbench import (

@@ -1,6 +1,6 @@
 """Follows the rules of a plan: which are in force, and the car that triggered each. Pure; times in s."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import Final
 
@@ -9,10 +9,6 @@ from msgspec.structs import replace
 
 from fleet.policy.debounce import Debounced, debounce
 from fleet.policy.plan.plan import (
-    ALL_CARS,
-    OTHER_CARS,
-    THIS_CAR,
-    Effect,
     Plan,
     PlanCondition,
     Quantifier,
@@ -143,21 +139,3 @@ def readings_used(
     """Return the readings that made a condition true, with their values: of the car that triggered it, or of all."""
     read = [trigger] if trigger is not None else _watched_cars(condition, cars, NO_CARS)
     return tuple(reading for car in read for reading in snapshot.describe_readings(condition.expression, car, now))
-
-
-def targets(effect: Effect, state: RuleState, subjects: Collection[str], roles: Mapping[str, str]) -> Iterator[str]:
-    """Yield the cars to which an effect of a rule in force applies. `roles` has the role of each car."""
-    match effect.who:
-        case "":
-            return
-        case who if who == THIS_CAR:
-            if state.trigger is not None:
-                yield state.trigger
-        case who if who == OTHER_CARS:
-            yield from (car for car in subjects if car != state.trigger)
-        case who if who == ALL_CARS:
-            yield from subjects
-        case who if who in subjects:
-            yield who
-        case who:
-            yield from (car for car in subjects if roles.get(car) == who)

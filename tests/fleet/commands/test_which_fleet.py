@@ -9,7 +9,7 @@ import zenoh
 from fleet.cli import cli
 from fleet.client.client import Fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
-from fleet.commands.fleets import stop_in_all_fleets
+from fleet.commands.which_fleet import stop_in_all_fleets
 from schemas import keys
 from schemas.bus import reply_message, router_config
 from schemas.gen import fleet_v1_pb2 as pb

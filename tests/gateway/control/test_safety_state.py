@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from gateway.control.holds_and_leases import (
+from gateway.control.safety_state import (
     MAX_ENDED_ESTOPS,
     MAX_ENDED_PAUSES,
     MAX_ESTOPS,

@@ -10,8 +10,8 @@ import pytest
 
 from fleet.console.certificate import ensure_certificate
 from fleet.console.connection_limit import MAX_STRANGERS_PER_ADDRESS
-from fleet.console.entrance import Entrance
 from fleet.console.network_console import LimitedListener
+from fleet.console.tls_entrance import Entrance
 from fleet.console.waiting_room import MAX_WAITING_PER_ADDRESS
 from tests.support.network_client import untrusting
 
