@@ -12,7 +12,7 @@ import click
 from click.shell_completion import BashComplete, FishComplete, add_completion_class
 
 from fleet.commands.command_group import CommandGroup, as_option, connect_option, fleet_option
-from fleet.usage_errors import command_path, describe_missing_package, describe_error
+from fleet.usage_errors import command_path, describe_error, describe_missing_package
 from schemas import commands
 from schemas.printable import printable_lines
 from schemas.process import startup, stdio

@@ -11,7 +11,7 @@ from schemas import topics
 HISTORY_TIMEOUT_S: Final = 10.0
 """Timeout for the history of many cars."""
 MAX_HISTORY_QUERIES: Final = 4
-"""Maximum number of queries for values that were lost on the way."""
+"""Maximum number of queries for one history, with those for values that were lost on the way."""
 MAX_HISTORY_S: Final = 7 * 86_400.0
 """Maximum of `since_s`: a week."""
 
@@ -34,7 +34,8 @@ def selector(key_expression: str, *, last: int | None = None, since_s: float | N
 def merge(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
     """Merge the readings of two answers, sorted by key and time, at most `last` of each key."""
     # If a link's queue is full, a gateway drops answers and does not block. So a client that finds gaps queries again.
-    boots: dict[str, int] = {}  # numbers the boots in the order of arrival, because the ids themselves are random
+    # Number the boots (runs of a gateway) in the order of arrival, because their ids are random.
+    boots: dict[str, int] = {}
     found: dict[tuple[str, int, int], Reading] = {}
     for reading in (*earlier, *more):
         boot = boots.setdefault(reading.value.boot_id, len(boots))
@@ -63,7 +64,7 @@ def gaps(readings: Iterable[Reading]) -> dict[str, int]:
 def describe_shortfalls(
     readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
 ) -> list[str]:
-    """Describe why there are fewer readings than requested: one line for each key, one for all states together.
+    """Describe why there are fewer readings than requested: at most two lines for each key, one for all states.
 
     readings: sorted as `merge` sorts.
     """
@@ -76,7 +77,7 @@ def describe_shortfalls(
         if topic.history_size <= 1:
             has_states = True
             continue
-        keeps = f"its gateway keeps the last {topic.history_size}"
+        keeps = f"its gateway keeps only the last {topic.history_size} values"
         oldest_s = found[0].age_s(now)
         full = len(found) >= topic.history_size
         if since_s is not None:
@@ -86,7 +87,7 @@ def describe_shortfalls(
             more = keeps if full else "its gateway has no more"
             lines.append(f"{key}: {len(found)} of {last}, because {more}")
     if has_states and last != 1:
-        lines.append("Gateways keep only the latest value of a state. A recording has all (`fleet record`).")
+        lines.append("Gateways keep only the latest value of a state. A recording has all values (`fleet record`).")
     return lines
 
 

@@ -68,7 +68,7 @@ def _from_group(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
 
 
 def connect_option(
-    words: str = "The bus, as tcp/HOST:PORT (default: FLEET_ENDPOINT, or port 7447 on this computer).",
+    words: str = "The bus, as tcp/HOST:PORT (default: FLEET_ENDPOINT, else the hub you joined, else port 7447 here).",
 ) -> _Decorator:
     """Return the option --connect with this help."""
     return click.option("-e", "--connect", "--endpoint", metavar="ENDPOINT", callback=_from_group, help=words)

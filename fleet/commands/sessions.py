@@ -94,10 +94,11 @@ def _open(path: Path) -> "Session":
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
-    """List the sessions in DIR (default: sessions): start, state, length, size, lost messages, stops, marks and cars.
+    """List the sessions in DIR: start, state, length, size, lost messages, stops, marks and cars.
 
-    A stop of several cars counts once, whoever asked for it. The list also shows damaged sessions, and what is damaged,
-    as far as their indexes tell. Only `fleet sessions verify` reads every message.
+    By default, DIR is that of the fleet file here, or `sessions`. A stop of several cars counts once, whoever asked for
+    it. The list also shows damaged sessions, and what is damaged, as far as their indexes tell. Only
+    `fleet sessions verify` finds all damage.
     """
     _show(_summaries(directory), as_json=as_json)
     if not as_json:
@@ -121,7 +122,7 @@ def _say_removed(place: Path) -> None:
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
 def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
-    """List the sessions that ran at TIME: a local time of day (14:05, on any day), `yesterday 14:05`, or a date."""
+    """List the sessions that ran at TIME: a local time of day (14:05, on any day), or with a day (yesterday 14:05)."""
     now_s = time.time()
     try:
         time_spec.is_within(time_text, 0, 0, now_s)  # rejects an invalid time even if there is no session
@@ -131,7 +132,7 @@ def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
     if not ran:
         raise click.ClickException(f"No session ran at {time_text}. `fleet sessions` lists all, with their start.")
     _show(ran, as_json=as_json)
-    click.echo(f"Open one there: `fleet replay {ran[-1].name} --from '{time_text}'`", err=True)
+    click.echo(f"Open one at that time: `fleet replay {ran[-1].name} --from '{time_text}'`", err=True)
 
 
 def _summaries(directory: Path | None) -> list["SessionSummary"]:
@@ -244,13 +245,13 @@ def _say_contents(about: "SessionSummary") -> None:
         click.echo(f"  {shown[key].ljust(width)}  {count:8}{rate}")
 
 
-@sessions.command(epilog="\b\nexample:\n  fleet sessions verify\n\nExit codes: 0 nothing is missing, 1 something is.")
+@sessions.command(epilog="\b\nexample:\n  fleet sessions verify\n\nExit codes: 0 it is whole, 1 it is not.")
 @session_argument
 @json_option
 def verify(session: Path, *, as_json: bool) -> None:
     """Check a recording: checksums, missing messages, schemas, clocks.
 
-    The command lists exactly what is missing.
+    The command says what is missing. With --json, it lists every gap.
     """
     from fleet.recording.tools.summary import growth_check, total
     from fleet.recording.tools.verify import verify as verify_session
@@ -367,8 +368,8 @@ def export(
 
     There is one table for each type of message. Its columns are key, car, log_time, publish_time, sequence, then the
     fields. Times are UTC; Parquet has them in microseconds. The names of columns contain the units. In Parquet, the
-    units are also in the metadata of the fields. Messages that are not protobuf are in the table `other`. A bag
-    contains only standard messages (docs/how-to/look-at-a-recording.md).
+    units are also in the metadata of the fields. Messages that are not protobuf, or do not fit their schema, are in the
+    table `other`. A bag contains only standard messages (docs/how-to/look-at-a-recording.md).
     """
     from fleet.commands.session_export import export_foxglove, export_ros2, export_tables
 

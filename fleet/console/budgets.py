@@ -36,8 +36,8 @@ COOLDOWN_S: Final = 15.0
 # asks.
 COMMAND_BURST: Final = 200.0
 COMMAND_RATE: Final = 20.0
-"""Commands of a device that ask gateways, at once and per second. A press counts once, even if its direction
-changes."""
+"""Commands of a device that ask gateways, at once and per second. A press counts once for
+each direction."""
 MAX_OPEN_COMMANDS: Final = 16
 """Maximum number of commands of one device that have no outcome yet. One command may be for many cars."""
 MAX_BUDGETS: Final = 1024

@@ -12,7 +12,10 @@ _ALL: Final = "all"
 
 
 class PlanChange(Struct, frozen=True):
-    """One part that differs, such as `role guide`, with its fields in both plans. Empty if a plan lacks the part."""
+    """One part that differs, such as `role guide`, with its fields in both plans.
+
+    `before` or `after` is empty if that plan lacks the part.
+    """
 
     part: str
     before: tuple[tuple[str, str], ...] = ()
@@ -27,7 +30,10 @@ class PlanChange(Struct, frozen=True):
 
 
 def plan_changes(before: Plan, after: Plan) -> tuple[PlanChange, ...]:
-    """Return the parts that differ: roles, fixed cars, rules, phases, and what a car without a role does."""
+    """Return the parts that differ: roles, fixed cars, rules, phases, and what a car without a role does.
+
+    The order of rules and phases is not compared.
+    """
     then, now = _parts(before), _parts(after)
     return tuple(
         PlanChange(part, then.get(part, ()), now.get(part, ()))

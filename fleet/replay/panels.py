@@ -1,8 +1,8 @@
 """Tables of the views: which field is drawn as a curve, as a state track or as a line of text. Pure, and without Rerun.
 
 A curve shows a number over time. A track shows a state over time. A text line is an entry of a log. A topic that has no
-row here is in the .rrd all the same, and Rerun's dataframe view shows it. Rerun calls the place of data an entity. The
-entity of a key is the key itself: `/fleet/red/sensor/range`.
+row here is in the .rrd (Rerun's file) all the same, and Rerun's dataframe view shows it. Rerun calls the place of data
+an entity. That of a key is the key with a `/` in front, escaped: `/fleet/red/sensor/range`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -31,7 +31,7 @@ class Curve(Struct, frozen=True):
 
 
 class Derivation(StrEnum):
-    """The value that a lens derives from a field."""
+    """The value that is derived from a field, by a lens of Rerun (lenses.py)."""
 
     TEXT_OR_NOTHING = "text_or_nothing"
     """A text, or no state if it is empty."""
@@ -200,7 +200,7 @@ _DRAWN: Final = frozenset[str]().union(*(panel.topics for panel in MAIN_PANELS +
 
 
 def _plain_panel(topic: Topic) -> Panel:
-    """Return the panel of a sensor that no table above draws: a curve per field with a unit, a track per word."""
+    """Return the panel of a sensor that no table above draws: a curve per field with a unit, a track per word field."""
     name = topic.name.removeprefix("sensor/").replace("_", " ")
     curves = tuple(Curve(topic.name, field, f"{name} ({field.replace('_', ' ')})") for field in topic.units)
     return Panel(name.capitalize(), curves, _tracks(topic.name, name, *topic.words))
@@ -318,7 +318,7 @@ def topic_of(key: str) -> str:
 
 
 def entity(key: str) -> str:
-    """Return the entity that Rerun's MCAP reader gives a key: it escapes all but word characters."""
+    """Return the entity that Rerun's MCAP reader gives a key: it escapes all but letters, digits, -, _ and ."""
     return "/" + "/".join(
         "".join(c if c.isalnum() or c in "-_." else f"\\{c}" for c in part) for part in key.split("/")
     )

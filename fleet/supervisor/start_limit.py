@@ -1,7 +1,7 @@
-"""Rate limits for starts and kills, so that restarts do not overload the machine further. Pure.
+"""Limits for starts, restarts and kills, so that restarts do not overload the machine further. Pure.
 
 A gateway needs 0.3 s of CPU time to start. If a hundred gateways start on two cores, they cannot all send a heartbeat
-in time. Each restart would delay the others further.
+in time. Those without one would be killed as hung and restarted, and each restart would delay the others further.
 """
 
 from collections.abc import Iterable

@@ -23,7 +23,7 @@ class Pending(Struct):
     """The frames that are not written yet. A `Later` is a frame with a delay before it."""
     sent: bool = False
     count: int = 1
-    """Number of merged commands of a stream."""
+    """Number of merged commands."""
     due_at: float = float("-inf")
     """When the next frame is due, at the end of the delay before it."""
     part: Hashable = None
@@ -55,7 +55,7 @@ class Pending(Struct):
 
 
 class CommandLog:
-    """Records each transition. Of a stream of drives, it records only start, end, and the first rejection by reason."""
+    """Records each transition. Of a stream of drives, it records only start, end, and rejections with a new reason."""
 
     def __init__(self) -> None:
         self._records: list[Record] = []
@@ -94,12 +94,12 @@ class CommandLog:
         )
 
     def record_sent(self, pending: Pending, now: float, words: str = "", reason: Reason | None = None) -> None:
-        """Record once that the first frame was written."""
+        """Record the command as sent, if that is not recorded yet."""
         if not pending.sent:
             self.record(pending, Phase.SENT, now, reason=reason, words=words)
 
     def record_rejection(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
-        """Record a rejection. For a stream, record only the first rejection for each reason."""
+        """Record a rejection. Of a stream, leave out one with the same reason as the sender's last one."""
         sender = pending.command.sender.name
         if pending.command.streamed:
             if self._rejected.get(sender) is reason:

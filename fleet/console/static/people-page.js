@@ -9,7 +9,7 @@ const RANKS = ["person", "lead"];
 
 export const post = (message) => ask("/people", JSON.stringify(message));
 
-// What the console tells of the devices on the network, and the function that reads it again. null: nothing yet.
+// What the console says about the devices on the network, and the function that reads it again. null: nothing is known.
 export function useLan() {
   const [found, setFound] = useState(null);
   const read = async () => {
@@ -24,7 +24,8 @@ export function useLan() {
   return [found, read];
 }
 
-// A code that ends: the last answer, the seconds that it is good for, and the functions that make one, end it, and show another answer.
+// The state of a code with a lifetime: the last answer of the console, the seconds left, and functions: `make` asks for a code, `end` hides it,
+// `setAnswer` shows another answer.
 export function useCode(message) {
   const [answer, setAnswer] = useState(null);
   const [endsAt, setEndsAt] = useState(0);

@@ -10,11 +10,13 @@ import pytest
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from fleet.hub import certificate_authority
 from fleet.hub.certificate_authority import BadRequestForCertificate
 from fleet.hub.certificate_parts import LIFETIME
+from schemas.bus import certificate_request
 from schemas.bus.certificate_dates import CertificateDates
 
 NOW = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
@@ -165,3 +167,14 @@ def test_dates_are_read_as_the_library_reads_them(ca: certificate_authority.KeyP
     assert dates.ends == certificate_authority.expires(late), "GeneralizedTime"
     for junk in (b"", b"junk", b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----"):
         assert CertificateDates.of(junk) is None
+
+
+def test_certificate_without_a_name_has_no_identity(tmp_path: Path) -> None:
+    """A renewal says why it failed. It does not end the program that renews."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    nobody = x509.Name([])
+    builder = x509.CertificateBuilder(nobody, nobody, key.public_key(), 1, NOW, NOW + timedelta(days=1))
+    path = tmp_path / "nobody.pem"
+    path.write_bytes(builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
+    with pytest.raises(ValueError, match="names no identity"):
+        certificate_request.identity_in(path)
