@@ -122,7 +122,7 @@ def _say_removed(place: Path) -> None:
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
 @json_option
 def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
-    """List the sessions that ran at TIME: a local time of day (14:05, on any day), or with a day (yesterday 14:05)."""
+    """List the sessions that ran at TIME: a local time of day (14:05, on any day), `yesterday 14:05`, or a day."""
     now_s = time.time()
     try:
         time_spec.is_within(time_text, 0, 0, now_s)  # rejects an invalid time even if there is no session

@@ -1,7 +1,7 @@
 """Parses times within a session as users type them: an offset from its start or end, or a date. Pure."""
 
 import re
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Final
 
 from schemas.duration import duration_s
@@ -16,6 +16,7 @@ _DAY_NS: Final = 86_400 * _NS
 _MAX_DAYS: Final = 3
 """Maximum number of days that a message proposes."""
 
+_DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}")
 _NUMBER: Final = re.compile(r"-?\d+([.,]\d+)?")
 
 
@@ -61,6 +62,19 @@ def _days_before(day: str, now_s: float) -> int | None:
     return _DAYS.get(day)
 
 
+def _day_ns(text: str, now_s: float) -> tuple[int, int] | None:
+    """Return the begin and the end of a local day, in ns since the epoch. None for another text."""
+    days = _days_before(text, now_s)
+    day = text if days is None else date(now_s, days)
+    if not _DATE.fullmatch(day):
+        return None
+    try:
+        begin = datetime.fromisoformat(day)
+        return int(begin.timestamp()) * _NS, int((begin + timedelta(days=1)).timestamp()) * _NS
+    except (ValueError, OverflowError, OSError):  # such as the year 1, which this computer cannot represent
+        return None
+
+
 def _date_ns(text: str) -> tuple[int, int]:
     """Return the begin and the end, in ns since the epoch, of a date with a time. Raises _Unreadable."""
     try:
@@ -104,13 +118,13 @@ def past_ns(text: str, now_s: float) -> int:
 
 
 def is_within(text: str, start_ns: int, end_ns: int, now_s: float) -> bool:
-    """Return True if a session from `start_ns` to `end_ns` ran at a local time of day or date. Raises ValueError."""
+    """Return True if a session from `start_ns` to `end_ns` ran at a local time or on a day. Raises ValueError."""
     if duration_s(text.removeprefix("-")) is not None:
         raise ValueError(f"{text} is an offset within one session. Write a local time (14:05) or a date.")
     if (begins := clock_begins(text, start_ns, end_ns)) is not None:
         return bool(begins)
     try:
-        begin_ns, behind_ns = _span_ns(text, start_ns, end_ns, now_s)
+        begin_ns, behind_ns = _day_ns(text, now_s) or _span_ns(text, start_ns, end_ns, now_s)
     except _Unreadable as error:
         raise ValueError(f"{error} Write a local time of day (14:05, yesterday 14:05), or a date.") from None
     return begin_ns <= end_ns and behind_ns > start_ns

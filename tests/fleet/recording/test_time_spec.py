@@ -89,6 +89,22 @@ def test_time_of_day_on_two_days_names_both() -> None:
     assert time_spec.is_within("14:05", NOON * S, (NOON + 2 * DAY_S) * S, NOON)
 
 
+@pytest.mark.parametrize(
+    ("text", "ran"),
+    [
+        ("2026-11-25", True),
+        ("wednesday", True),
+        ("today", True),
+        ("2026-11-24", False),
+        ("yesterday", False),
+        ("2026-11-26", False),
+        ("2026-11-25 00:00", False),
+    ],
+)
+def test_session_ran_on_a_day(text: str, ran: bool) -> None:
+    assert time_spec.is_within(text, NOON * S, (NOON + 60) * S, NOON) is ran
+
+
 @pytest.mark.parametrize("text", ["11:58", "25:00", "12:60", "yesterday", "tomorrow 12:00", "noon", "12"])
 def test_span_outside_session_is_refused(text: str) -> None:
     try:
