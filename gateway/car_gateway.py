@@ -14,6 +14,7 @@ import random
 import sys
 import time
 from collections.abc import Mapping
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -189,7 +190,7 @@ class CarGateway:
             self._keep_hub(),
             self._check_rival(),
             self._estop_sync.keep_synced(self._merge),
-            *([self._revocation.run(self._on_revoked)] if self._bus.identity else []),
+            *([self._revocation.run(self._on_revoked, self._on_certificate_end)] if self._bus.identity else []),
             self._answer(self._service.values),
             self._answer(self._service.histories),
         )
@@ -252,6 +253,20 @@ class CarGateway:
             "`fleet join` here make another certificate; then start this gateway again."
         )
         self._commands.log(Level.ERROR, "revoked", words)
+        self._halt(words)
+
+    def _on_certificate_end(self, ended: datetime) -> None:
+        """Stop the car, because nobody can command it until there is a new certificate, and it may be moving."""
+        car, who = self._settings.car, self._bus.identity
+        words = (
+            f"the certificate of {who} ended on {ended:%Y-%m-%d}, so the hub refuses this gateway. Nobody can command "
+            f"{car} from here, so it is stopped. `fleet hub invite --car {car}` on the hub's computer and `fleet join` "
+            "here make another certificate."
+        )
+        self._commands.log(Level.ERROR, "certificate_ended", words)
+        self._halt(words)
+
+    def _halt(self, words: str) -> None:
         self._control.halt(words, self._loop.time())
         self._wake.set()
 

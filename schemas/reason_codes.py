@@ -97,6 +97,9 @@ EVENTS: Final[dict[str, EventCode]] = {
     "revoked": EventCode(
         Level.ERROR, "The hub passes on no messages of this gateway, whose certificate was revoked. The car is stopped."
     ),
+    "certificate_ended": EventCode(
+        Level.ERROR, "The certificate of this gateway has ended, so the hub refuses the gateway. The car is stopped."
+    ),
     "parent_gone": EventCode(
         Level.WARNING, "The process that started this gateway has ended, so the gateway ends too."
     ),

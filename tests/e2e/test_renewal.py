@@ -3,6 +3,7 @@
 A certificate that was made 300 days ago is due. Nobody sleeps for 265 days here.
 """
 
+import contextlib
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 
@@ -21,7 +22,7 @@ from schemas.words import Rank
 from tests.support.processes import FleetProcesses, driving, wait_for
 from tests.support.secure import client_of, secure_fleet
 
-ANN, MIA, EVE, RED = person("ann"), person("mia"), person("eve"), car("red")
+ANN, MIA, EVE, RED, BLUE = person("ann"), person("mia"), person("eve"), car("red"), car("blue")
 DUE = timedelta(days=300)
 ENDS_SOON_S = 12
 """Life of a certificate that ends in the test: it is renewed at once, and its session goes on after 5 s."""
@@ -48,7 +49,7 @@ def is_due(store: HubStore, identity: str) -> bool:
 
 @pytest.fixture(scope="module")
 def secured(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[FleetProcesses, HubStore]]:
-    with secure_fleet(tmp_path_factory.mktemp("renewal"), ANN, [MIA, EVE, RED]) as made:
+    with secure_fleet(tmp_path_factory.mktemp("renewal"), ANN, [MIA, EVE, RED, BLUE]) as made:
         yield made
 
 
@@ -86,6 +87,33 @@ def test_drive_goes_on_while_both_are_renewed_and_their_first_certificates_end(
     assert {
         key: each for key, each in numbers.items() if sorted(each) != list(range(each[0], each[0] + len(each)))
     } == {}
+
+
+def test_gateway_stops_its_car_when_its_certificate_ends(secured: tuple[FleetProcesses, HubStore]) -> None:
+    """Nothing renews it, as on a hub that cannot sign. Nobody can command the car then, and a mode has no end."""
+    fleet, store = secured
+    sim, (link,) = fleet.simulate("blue:arduino:tcp")
+    age(store, BLUE, LIFETIME - timedelta(seconds=ENDS_SOON_S))
+    dates = store.credentials.dates(BLUE)
+    assert dates is not None
+    authority = store.directory / "ca.key"
+    hidden = authority.rename(authority.with_suffix(".hidden"))
+    try:
+        gateway = fleet.gateway(link, car="blue")
+        with Client(store.credentials.endpoint, kind=Rank.PERSON, identity=ANN) as ann:
+            fleet.ready("blue")
+            ann.car("blue").mode("tracking")
+            wait_for(lambda: driving(sim, "blue"), "blue drives")
+            wait_for(lambda: not driving(sim, "blue"), "blue stands")
+            assert datetime.now(UTC) >= dates.ends
+            assert "[certificate_ended]" in gateway.stderr
+            hidden.rename(authority)
+            age(store, BLUE, timedelta())
+            wait_for(lambda: "blue" in ann.cars(), "the gateway uses the new certificate")
+            ann.car("blue").mode("manual")
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            hidden.rename(authority)
 
 
 def test_command_alone_renews_too(secured: tuple[FleetProcesses, HubStore]) -> None:
