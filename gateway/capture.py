@@ -18,7 +18,7 @@ MAX_LINE_BYTES: Final = 8 * 1024 * 1024
 
 
 class BadCapture(ValueError):
-    """A file that is not a capture. The message names the file, the line and the fault."""
+    """A file that is not a capture. The message names the file, the fault, and the number of a bad line."""
 
 
 class CapturedBytes(Struct, frozen=True):
@@ -48,7 +48,7 @@ class CaptureWriter:
         self._file.close()
 
     def discard(self) -> None:
-        """Close the empty file and remove it."""
+        """Close the file, which has no pieces, and remove it."""
         self.close()
         self.path.unlink(missing_ok=True)
 

@@ -1,9 +1,9 @@
 """The gateway of one car: joins link, decoder, control and bus in one asyncio loop. Read this file first.
 
 Up: `LinkLoop` reads bytes from the link, and the driver decodes them into events. `CarPublisher` publishes the
-measurements, and control updates its state. Down: the bus hands a query on `@cmd` over to the loop. `CommandHandler`
-passes the command to control, and answers it after the writer has had a turn. Only `Writer` writes to the car, one
-frame at a time.
+measurements, and the driver updates its state. Down: the bus hands a query on `@cmd` over to the loop. `CommandHandler`
+passes the command to control, and answers it after the writer has had a turn. `Writer` writes to the car, one frame at
+a time.
 """
 
 import asyncio
@@ -59,7 +59,7 @@ RIVAL_SHUTDOWN_S: Final = SHUTDOWN_S + 2.0
 conflict, stop the car and close the port."""
 HEALTH_INTERVAL_S: Final = 1.0
 LEARNED_INTERVAL_S: Final = 10.0
-"""Minimum time between two saves of what was learned about the car."""
+"""Minimum time between two saves of what was learned about the car, unless one must be saved at once."""
 ANSWER_PAUSE_S: Final = 0.005
 """Pause after each slice of a long answer, so that Zenoh can send it. Zenoh drops what exceeds its buffer."""
 CANCEL_RETRY_S: Final = 0.5
@@ -90,7 +90,7 @@ class Settings(Struct, frozen=True):
 
 
 class CarGateway:
-    """One car's gateway. `run` returns after `stop`, when the car has stopped."""
+    """One car's gateway. `run` returns after `stop`, when the stop of the car is over or was given up."""
 
     def __init__(
         self, settings: Settings, opened: bus.Bus, service: CarService, sleep: SleepWatch | None = None
@@ -164,7 +164,7 @@ class CarGateway:
         self._worst_lag_s = 0.0
 
     async def run(self) -> bool:
-        """Serve the car until `stop`, then until the car has stopped. Return False if it could not be stopped.
+        """Serve the car until `stop`, then until its stop is over. Return False if the car could not be stopped.
 
         Raises AlreadyServed (see bus/car_service.py), and LinkError if the link cannot be opened at the start.
         """
@@ -434,7 +434,10 @@ def begin_logging() -> None:
 
 
 async def serve(settings: Settings, opened: bus.Bus, service: CarService) -> bool:
-    """Serve one car until a signal. Return False if the car could not be stopped. Raises AlreadyServed or LinkError."""
+    """Serve one car until a signal, or until the parent ends.
+
+    Return False if the car could not be stopped, or if the gateway failed. Raises AlreadyServed or LinkError.
+    """
     car = CarGateway(settings, opened, service)
     # Imported objects live as long as the process. Without this, the garbage collector scans them again and again while
     # readings wait.

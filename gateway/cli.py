@@ -30,7 +30,7 @@ COMMANDS: Final = {
     "monitor": ("gateway.tools.monitor", "show what a car sends: the decoded readings beside the raw bytes"),
     "send": ("gateway.tools.send", "check one frame, and send it to a car on the desk"),
 }
-"""For each subcommand, the module with its `add_arguments` and `run`, and its line in the help.
+"""For each subcommand except `run`, the module with its `add_arguments` and `run`, and its line in the help.
 
 A module is imported only when its subcommand is called.
 """

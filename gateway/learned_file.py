@@ -25,7 +25,7 @@ class LearnedFile:
         self._owner = {"link": link, "platform": platform}
         self._saved = ""
         self.trouble = ""
-        """A sentence on why an existing file was not used. Empty if it was used."""
+        """A sentence on why an existing file was not used. Else empty."""
 
     def load(self, use: Callable[[Mapping[str, Any]], T]) -> T:
         """Call `use` with what was learned, or with an empty mapping. `use` raises ValueError for damaged content."""
@@ -43,7 +43,7 @@ class LearnedFile:
             return use({})
 
     def save(self, learned: Mapping[str, Any]) -> None:
-        """Replace the file if anything has changed. Raises OSError."""
+        """Replace the file if anything has changed since the last save. Raises OSError."""
         text = json.dumps(self._owner | {"learned": learned})
         if text == self._saved:
             return

@@ -22,9 +22,9 @@ from schemas.links import BAUD, SerialUrl, UsbUrl
 from schemas.words import FrameVerdict, Level, LinkState, Motors
 
 SLICE_BYTES: Final = 1024
-"""Maximum bytes that are decoded before other tasks, such as a stop, get a turn. A car sends 960 a second."""
+"""Maximum bytes that are decoded before other tasks, such as a stop, get a turn. At 9600 baud, 960 come a second."""
 MAX_BYTES_AGE_S: Final = 0.25
-"""Maximum age of bytes that are decoded. Older ones are discarded, because newer ones matter more."""
+"""Maximum time from the reading of bytes to their decoding. Later they are discarded: newer ones matter more."""
 MIN_DAMAGED: Final = 3
 """Number of damaged frames after which the link looks for the cause."""
 LOOK_INTERVAL_S: Final = 10.0
@@ -52,13 +52,14 @@ class LinkLoop:
         """Make the loop of a link. `on_gap` is called before bytes are decoded, to detect a gap of the asyncio loop.
 
         `log_open` logs that the link is open. It is called when the link opens. After a link that was lost before it
-        was proven, it is called only when the new link is proven: by a reading, or by its age (see `Attempts`).
+        was proven, it is called only when the new link is proven: by a reading or an echo, or by its age (see
+        `Attempts`).
         """
         self._loop = asyncio.get_running_loop()
         now = self._loop.time()
         self.url = url
         self.link: Link | None = None
-        """The open link."""
+        """The open link, or None."""
         self.health = LinkHealth(since=now, bytes_per_s=control.driver.model.profile.baud / BITS_PER_BYTE)
         self._car = control.car
         self._control = control
@@ -78,9 +79,10 @@ class LinkLoop:
         self._look_at = now
 
     async def keep_open(self, *, may_fail: bool, is_in_use: Callable[[], Awaitable[bool]]) -> None:
-        """Keep the link open, and read from it. Without `may_fail`, raise LinkError if the first attempt fails.
+        """Keep the link open, and read from it. Without `may_fail`, raise LinkError if it does not open at the start.
 
-        `is_in_use` returns True if another gateway, which has to end, may still have the port open.
+        `is_in_use` returns True if another gateway, which has to end, may still have the port open. As long as it does,
+        a failed attempt is repeated. After that, a busy port is tried once more.
         """
         looked_again = False
         while True:
@@ -177,7 +179,7 @@ class LinkLoop:
                 self._log_open()
 
     def lost(self, reason: str) -> None:
-        """Record that the link is down, and fail the commands that wait for it."""
+        """Record that the link is down, and fail all commands."""
         now = self._loop.time()
         self.link = None
         self.health.on_lost(reason, now)
@@ -189,7 +191,7 @@ class LinkLoop:
     def check(self, now: float) -> None:
         """Log the opening of a link that is now proven, if this opening is not logged yet.
 
-        If bytes are damaged or missing, let the link look for the cause. Log each cause once.
+        If bytes are damaged or missing, let the link look for the cause. Log a cause unless it was logged last.
         """
         if self._attempts.check_proven(now, has_reading=False):
             self._log_open()
@@ -207,5 +209,5 @@ class LinkLoop:
 
 
 def at_rate(url: LinkUrl, baud: int) -> LinkUrl:
-    """Return a link with the baud rate of its car, unless its URL names another rate."""
+    """Return a link with the baud rate of its car, unless its URL has another rate than the default, `BAUD`."""
     return url.at_rate(baud) if isinstance(url, SerialUrl | UsbUrl) and url.baud == BAUD else url

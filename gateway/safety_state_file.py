@@ -107,7 +107,7 @@ def _exchanged(
 
 
 def _parse(content: Any, now_ns: int) -> PersistedSafety:
-    """Return the state in a file, or raise ValueError, TypeError or KeyError. Older versions only wrote the hold."""
+    """Return the state in a file, or raise one of `DAMAGE`. Older versions only wrote the hold."""
     return PersistedSafety(
         _hold(content["hold"], now_ns),
         _estops(content, now_ns),
@@ -147,7 +147,7 @@ def _who_and_why(content: Any) -> tuple[str, str, str]:
 
 
 def _loan(content: Any, now_ns: int) -> Loan | None:
-    """Return the loan, or None if there is none, or if it is over."""
+    """Return the loan, or None if there is none, or if it is over or has no end."""
     if content is None:
         return None
     to, by, since_ns = _text(content["to"]), _text(content["by"]), _past(content["since_ns"], now_ns)

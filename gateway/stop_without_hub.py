@@ -5,8 +5,8 @@ It is needed twice:
 - A gateway starts while its hub is away, and the car may still follow its last command. Suppose systemd's watchdog
   ended a gateway during an outage of the network. The next gateway waits for the hub first, and would leave a moving
   car alone.
-- A gateway fails because its driver fails, perhaps one from another package. The failed driver writes no frames any
-  more.
+- A gateway fails, perhaps because its driver does, which may come from another package. Such a driver may write no
+  frames any more.
 
 Nothing here reads from the bus or publishes on it.
 """

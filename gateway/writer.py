@@ -1,4 +1,4 @@
-"""Writes frames to the car, one at a time. Nothing else writes to it."""
+"""Writes frames to the car, one at a time. In a gateway, only `stop_without_hub` writes to it, too."""
 
 import asyncio
 from collections.abc import Callable

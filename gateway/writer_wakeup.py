@@ -8,7 +8,7 @@ from gateway.control.controller import Controller
 from gateway.control.driver import Driver
 
 MAX_SLEEP_S: Final = 3600.0
-"""Maximum sleep of the writer, because asyncio accepts no infinite timer."""
+"""Maximum sleep of the writer, even if the driver has nothing to do."""
 
 
 class WriterWakeup:

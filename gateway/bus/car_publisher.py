@@ -81,7 +81,7 @@ class CarPublisher:
         """When the bus was last unreachable."""
         self._pending: deque[tuple[bus.Publisher, Any, int]] = deque()
         self.dropped = 0
-        """Number of dropped records, and of payloads that are not poses."""
+        """Number of dropped records, and of published poses that are not usable."""
 
     # ------------------------------------------------------------------ readings
 

@@ -70,7 +70,7 @@ class CommandHandler:
         """Queries, each with the id of its command and the answer to send."""
         self._logs_commands = json_log.is_wanted()
         self._sent: set[str] = set()
-        """Ids of commands whose first frame was written since the last answers were sent."""
+        """Ids of commands that were recorded as sent since the last answers were sent."""
 
     def on_request(self, request: Request) -> None:
         """Pass a command to control. Queue the answer to a query until the writer has had a turn."""

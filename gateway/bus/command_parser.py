@@ -53,7 +53,7 @@ ARM_JOINTS: Final = 6
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
 _SAME_QUERY_NS: Final = 2_000_000_000
-"""Maximum time in which one query reaches all gateways (see `_id`)."""
+"""Length of the periods of the wall clock in which equal e-stops count as one query (see `_id`)."""
 _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
 """The kinds of sender that a command may name. Only the fleet file says which person is a lead."""
 # One query may send these verbs to several cars (docs/reference/keys.md#command-keys).
@@ -121,7 +121,10 @@ def _stop_anyway(command: Command, words: str, request: Request) -> Command:
 
 
 def _id(request: Request, now_ns: int) -> str:
-    """Return an id for a request without one. For an e-stop to several cars, all gateways make the same id."""
+    """Return an id for a request without one. For an e-stop to several cars, all gateways should make the same id.
+
+    They do unless it reaches them in different periods of `_SAME_QUERY_NS` by their wall clocks.
+    """
     if request.verb != Verb.ESTOP or not request.by_wildcard:
         return uuid.uuid4().hex
     query = (request.payload or b"") + str(now_ns // _SAME_QUERY_NS).encode()

@@ -23,7 +23,8 @@ from schemas.words import Scope
 BATCH_DELAY_S: Final = 0.2
 """Delay before a query, so that gateways that start together are queried together."""
 MAX_BATCH_DELAY_S: Final = 3.0
-"""Maximum delay before a query. The delay doubles while more gateways start."""
+"""Maximum of this delay, which doubles while more gateways start. Before a query to all gateways that is not the first
+one, a random delay is added (see `ANSWERS_PER_S`)."""
 BATCH_RESET_S: Final = 1.0
 """Time without a new gateway after which the delay begins at `BATCH_DELAY_S` again."""
 FIRST_RETRY_S: Final = 0.5

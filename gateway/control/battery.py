@@ -73,7 +73,10 @@ class Battery(Struct):
     same side of `level`: all worse, or all better."""
 
     def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
-        """Update the level with a measured voltage. Return True if it has changed. With `loaded`, motors may be on."""
+        """Update the level with a measured voltage. Return True if it has changed; the first voltage changes none.
+
+        With `loaded`, motors may be on.
+        """
         self.voltage_v = voltage_v
         self.measured_at = now
         if loaded:

@@ -24,11 +24,13 @@ class HeldMotion(Struct):
     motion: Motion
     pending: Pending
     expires_at: float
-    """When the drive ends. Before its frame is written: when the drive is given up, unless a stream renews it."""
+    """When the drive ends. Before its frame is written: when the drive is given up, unless its sender renews it."""
     duration_s: float = 0.0
     """How long the drive lasts after its frame is written. 0 for a stream: each sample counts from its arrival."""
     began_at: float | None = None
-    """When the frame of the drive was written, or None if the drive still waits."""
+    """When the frame of the drive was written, or None if the drive still waits.
+
+    If the drive continues the same motion of another sender without a frame: when it was accepted."""
     range_cm: float | None = None
     """The last distance (in cm) that was measured before that frame was written. None if it is not known."""
 
@@ -71,7 +73,7 @@ class CommandQueue(Struct):
         return float("inf") if held is None else min(held.expires_at, self.senders.lost_at(held.sender.name))
 
     def deadlines(self) -> list[float]:
-        """Return when the queued commands expire."""
+        """Return when the queued commands expire, and when the held motion ends."""
         if not self.has_commands:
             return []
         waiting = [*self.one_shots, *([self.mode_change] if self.mode_change is not None else [])]
@@ -79,7 +81,7 @@ class CommandQueue(Struct):
         return times if self.held is None else [*times, self.held_until]
 
     def expire(self, now: float) -> None:
-        """Expire the commands that have waited too long for a busy car.
+        """Expire the one-shots and the mode that have waited too long for a busy car.
 
         An action with many frames does not expire while they are written: the time counts anew for each frame.
         """
@@ -92,7 +94,7 @@ class CommandQueue(Struct):
     # ------------------------------------------------------------------ actions on parts of the car
 
     def add_part(self, pending: Pending, frames: Iterable[Any], part: Hashable, now: float) -> None:
-        """Queue an action on a part of the car. End an action on the same part that is still going on."""
+        """Queue an action on a part of the car. End an action on the same part that has delayed frames left."""
         words = f"another {pending.command.verb} by {pending.command.sender.text_name}"
         for other in [each for each in self.one_shots if each.lasts and each.part == part]:
             self._end_part(other, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
@@ -126,7 +128,7 @@ class CommandQueue(Struct):
     def on_part_written(self, pending: Pending, now: float) -> None:
         """Remove the frame of an action that was written. Record the action as sent.
 
-        An action with delays is recorded as sent at its first frame, every other one at its last.
+        An action is recorded as sent at its first frame if there is a delay after that, else at its last frame.
         """
         pending.frames.popleft()
         pending.begin_delay(now)

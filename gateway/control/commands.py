@@ -96,7 +96,7 @@ class Stop(Struct, frozen=True):
 
 
 class EmergencyStop(Struct, frozen=True):
-    """Stop the car, and refuse commands until a resume with this id. If `fleet_wide`, all gateways do so."""
+    """Stop the car, and refuse drives, modes and actions until a resume. If `fleet_wide`, all gateways do so."""
 
     why: str = ""
     fleet_wide: bool = False

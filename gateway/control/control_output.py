@@ -21,8 +21,8 @@ class CommandRecord(Struct, frozen=True):
     evidence: tuple[str, ...] = ()
     count: int = 1
     basis: str = ""
-    """In the last record of a stop: `shown` if readings show the stop, `sent` if only its frames were written. In the
-    last record of a drive: `sent`."""
+    """In the last record of a stop that is over: `shown` if readings show the stop, `sent` if only its frames were
+    written. In the last record of a drive that was sent and has ended as commanded: `sent`. Else empty."""
 
 
 class LogRecord(Struct, frozen=True):

@@ -44,7 +44,7 @@ D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
 START_MARGIN_S: Final = 1.0
 """Margin for a drive that waits for the car. If its frame is not written, the drive expires after the announced wait or
-its own duration, whichever is longer, plus this margin."""
+its own duration, whichever is longer, plus this margin, but at most after `MAX_QUEUE_TIME_S`."""
 
 
 class Controller(Generic[D_co]):
@@ -75,7 +75,7 @@ class Controller(Generic[D_co]):
         self._queue = CommandQueue(self._log, self._senders, self.safety)
         self.driver = driver(Desk(car, self._log, self._queue, battery_policy or BatteryPolicy(), speed_max))
         self._mover = ""
-        """The person whose drive or mode was the last to move the car."""
+        """The person whose drive or mode was accepted last, even if its frame is not written yet."""
         self._slept_at = float("-inf")
         """When the last sleep of the computer was noticed."""
         self.was_open = False
@@ -469,7 +469,7 @@ class Controller(Generic[D_co]):
         return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
 
     def _wait(self, pending: Pending, now: float) -> str:
-        """Describe how long a drive or a mode waits for its frame. Empty if it need not wait."""
+        """Describe how long a drive or a mode waits for its frame. Empty for a stream, or if it need not wait."""
         command = pending.command
         if command.streamed or (wait_s := self.wait_s(command.what, now)) < LATE_DRIVE_S:
             return ""
@@ -482,7 +482,7 @@ class Controller(Generic[D_co]):
         return f"begins in {wait_s:.1f} s at most: {self.car} is busy with {what}"
 
     def _prolong_drive(self, held: HeldMotion, pending: Pending, duration_s: float, now: float) -> Answer:
-        """Extend a held motion without another frame, because its sender has sent the same drive again."""
+        """Set the end of a held motion anew without another frame, because its sender has sent the same drive again."""
         if held.pending.sent:
             held.expires_at = now + duration_s
         else:

@@ -85,9 +85,9 @@ class Rejected(Struct, frozen=True):
 
 
 class TextLine(Struct, frozen=True):
-    """A whole line of text between frames, such as a debug print, with its line end. It does not count as damage.
+    """A text between frames, such as the line of a debug print. It does not count as damage.
 
-    The line may be in a longer run of unreadable bytes. `at` is the time of the last byte of that run.
+    The text may be in a longer run of unreadable bytes. `at` is the time of the last byte of that run.
     """
 
     raw: bytes
@@ -203,7 +203,7 @@ class DriverClaims(Protocol):
 
     @property
     def range_cm(self) -> float | None:
-        """The last measured distance, or None if the car measures none."""
+        """The last measured distance, or None if none was measured."""
 
     @property
     def shows(self) -> Shows:
@@ -410,7 +410,7 @@ class Driver(ABC):
         """Return when a motion can be sent to the car, as far as that is known."""
 
     def wait_words(self, now: float) -> str:
-        """Name what must happen before the car may be driven, such as `its set-up`. Empty if it may be driven now."""
+        """Name what must happen before the car may be driven, such as `its set-up`. Empty if at most a stop must."""
         del now
         return ""
 
@@ -443,7 +443,7 @@ class Driver(ABC):
 
     @property
     def finished(self) -> bool:
-        """Return True after `shut_down` if the stop is over, or the car did not show it in time."""
+        """Return True after `shut_down` if the stop is over or was given up: not shown in time, or the link is down."""
         return self.shutting_down and not self.is_stopping
 
     @abstractmethod
@@ -467,7 +467,7 @@ class Driver(ABC):
 
     @abstractmethod
     def shut_down(self, now: float) -> None:
-        """Stop the car for the last time, and reject all later commands, because the gateway ends."""
+        """Stop the car for the last time, and send no later commands, because the gateway ends."""
 
     def stop_if_open(self, now: float) -> None:
         """Stop the car, unless the link is down or the gateway shuts down."""
@@ -514,9 +514,10 @@ class Driver(ABC):
         self.senders.halt(now, by)
 
     def end_drive(self, words: str, now: float) -> None:
-        """End a held motion whose time is over. Record it as sent, because no reading shows that the car really drove.
+        """End a held motion whose time is over. If its frame was written, record it as sent.
 
-        If the distance has changed, add that to the record. It is no proof: something in front may have moved.
+        If a reading shows a movement, add that to the record. A changed distance is no proof that the car really drove:
+        something in front may have moved.
         """
         held, model = self.queue.held, self.model
         if held is None or held.began_at is None:  # the frame of the drive was not written

@@ -56,7 +56,7 @@ class LinkHealth(Struct):
         self.last_reading_at = at
 
     def on_rejected(self, cause: str, count: int = 1) -> None:
-        """Count received bytes that are not readings."""
+        """Count frames or bytes that are not readings or were not used, or a trouble of the link, by cause."""
         self.rejects[cause] = self.rejects.get(cause, 0) + count
 
     def on_written(self, count: int, now: float) -> None:

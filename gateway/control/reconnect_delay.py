@@ -11,7 +11,7 @@ down."""
 PROVEN_S: Final = 3.0
 """Time after which an open link counts as proven even without a reading."""
 MAX_LOGGED_CAUSES: Final = 10
-"""Maximum different causes that are logged until a link is proven."""
+"""Maximum different causes that are logged until a link is proven. The opening of the link counts as one."""
 _OPENED: Final = ""
 
 
@@ -23,9 +23,9 @@ def delay_s(failures: int, jitter: float) -> float:
 class Attempts:
     """Counts the attempts to open one link. They must not be frequent, because each may reset a car's board.
 
-    A link is proven by a reading, or after `PROVEN_S`. After the loss of a proven link the delay starts from the
-    shortest. A link that is lost before it is proven counts as a failure. Until a link is proven, each cause of a loss
-    is logged only once, and so is the opening of the link.
+    A link is proven by a reading or an echo, or after `PROVEN_S`. After the loss of a proven link the delay starts from
+    the shortest. A link that is lost before it is proven counts as a failure. Until a link is proven, each cause of a
+    loss is logged only once, and so is the opening of the link.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,8 @@
 """Decides whether a command may be carried out now: a table of what each command needs, and a rule for each need.
 
-Pure: it gets the context of the car and returns a refusal or None. A stop or e-stop is never refused. Only two refusals
-are elsewhere: the parser's, of a command that it cannot read, and the controller's, of one that came before.
+Pure: it gets the context of the car and returns a refusal or None. A stop or e-stop is never refused here. Elsewhere
+are the refusals of the bus, of commands that are too many, of the parser, of a command that it cannot read or whose
+sender is not proven, and of the controller, of a command that came before, and of a stop that it cannot send.
 """
 
 from typing import Final
@@ -49,7 +50,7 @@ class CommandContext(Struct, frozen=True):
     link_reason: str
     closing: bool
     asked: Mode | None
-    """The commanded mode, even if the car is not in it yet."""
+    """The commanded mode, even if the car is not in it yet. Manual if the readings show that the car has left it."""
     authority: Authority
     ended: tuple[str, ...]
     """Ids of ended e-stops."""
@@ -130,7 +131,7 @@ def needs(what: Action) -> Needs:
 
 
 def refuse(command: Command, context: CommandContext) -> Refusal | None:
-    """Return why the command is refused, or None if it is not. The text names the car, the state, and what to do."""
+    """Return why the command is refused, or None if it is not. The text tells the cause, and mostly what to do."""
     what, sender = command.what, command.sender
     if isinstance(what, Stop | EmergencyStop):
         return None
@@ -151,7 +152,7 @@ def refuse(command: Command, context: CommandContext) -> Refusal | None:
 def _out_of_time(command: Command, context: CommandContext) -> str | None:
     """Return why the command is too old, or too far in the future. None if it is not.
 
-    A command without `asked` is refused only just after a sleep of the computer.
+    A command of unknown age is refused only just after a sleep of the computer.
     """
     age_s, clocks = command.age_s, f"Set the clock of its computer, or of the one that runs {context.car}'s gateway."
     if age_s is None:

@@ -72,7 +72,7 @@ class Safety(Struct):
 
     @property
     def estops(self) -> tuple[Estop, ...]:
-        """Return the e-stops in force, oldest first."""
+        """Return the e-stops in force, in the order in which this gateway learned of them."""
         return tuple(self._estops.values())
 
     @property
@@ -93,7 +93,7 @@ class Safety(Struct):
     # ------------------------------------------------------------------ hold and e-stops
 
     def put_on_hold(self, name: str, at_ns: int, rank: Rank = Rank.PERSON) -> None:
-        """Put the car on hold, and end a lease of the coordinator. A lead's hold replaces any other hold."""
+        """Put the car on hold, and end a lease of the coordinator. A lead's hold replaces one that no lead began."""
         if self.hold is None or (rank is Rank.LEAD and self.hold.rank is not Rank.LEAD):
             self.hold = Hold(name, at_ns, rank)
         if self.lease is not None and self.lease.holder.kind is Rank.COORDINATOR:

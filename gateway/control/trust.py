@@ -71,7 +71,7 @@ _SAME: Final = {
     _T.STOPPED: {_E.HEARD, _E.NOT_SHOWN},
     _T.DRIVING: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
     _T.IN_MODE: {_E.HEARD, _E.NOT_SHOWN, _E.STOP_SHOWN, _E.STOP_SENT},
-    # Only a reading ends the silence, and only evidence ends the doubt.
+    # A stop that is merely sent does not end the silence. Neither a new stop nor a reading alone ends the doubt.
     _T.UNHEARD: {_E.STOP_BEGUN, _E.STOP_SENT, _E.DOUBTED, _E.NOT_SHOWN, _E.SILENT},
     _T.UNPROVEN: {_E.STOP_BEGUN, _E.DOUBTED, _E.NOT_SHOWN, _E.HEARD},
 }
@@ -85,7 +85,7 @@ TRANSITIONS: Final[dict[tuple[CarTrust, TrustEvent], CarTrust]] = {
 """The next state for every state and event; a test checks all of them."""
 
 STOP_GOES_ON: Final = frozenset({_T.RECOVERING, _T.STOPPING, _T.UNHEARD, _T.UNPROVEN})
-"""States in which the gateway sends stops until the car shows one."""
+"""States in which the gateway sends stops until one is over."""
 
 KNOWN: Final = frozenset({_T.STOPPING, _T.STOPPED, _T.DRIVING, _T.IN_MODE})
 """States in which the last recovery is over and no write has failed since, so the car reads frames as meant."""

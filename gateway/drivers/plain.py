@@ -4,9 +4,10 @@ Such a car continues a motion until it gets another one, or until its dead-man t
 of frames. It has no modes. A family defines its frames, and what its readings show, with class attributes and a few
 methods. Waiting, repeating, failing and recording are done here (docs/how-to/write-a-driver.md).
 
-*Claims.* A stop ends as `sent` when its frames are written and a car that received them has had time to stop. A family
-whose readings show more calls `show_rest`; then the stop ends as `shown`. If its cars could show a stop (`can_show`)
-but do not in time, the stop counts as not confirmed, and the driver continues to send it.
+*Claims.* A stop ends as `sent` when its frames are written and a car that received them has had time to stop. A car
+that sends readings must have sent one on this link. A family whose readings show more calls `show_rest`; then the stop
+ends as `shown`. If its cars could show a stop (`can_show`) but do not in time, the stop counts as not confirmed, and
+the driver continues to send it.
 
 *Safe motions.* If a car has a dead-man timer, a held motion is sent again well before that time is over. So one lost
 frame does not stop the car, but a lost link does. If a car has no such timer, a stop that no reading shows is sent
@@ -101,7 +102,7 @@ class PlainModel(Struct):
     range_at: float = float("-inf")
     turned_at: float = float("-inf")
     """When a reading last showed that the wheels turned. Stays -inf if wheels are not measured. The driver of a family
-    sets it. Then a drive is shown, and a car that moves at rest is stopped."""
+    sets it. Then the record of a drive says that the wheels turned, and a car that moves at rest is stopped."""
     sent_motion: Motion = Motion.STOP
     """The motion whose frame was written last."""
     speed: float = 0.5
@@ -122,7 +123,7 @@ class PlainModel(Struct):
 
     @property
     def at_rest(self) -> bool:
-        """True if the car stands still after a stop."""
+        """True if a stop is over, which the readings may show or not (see `basis`)."""
         return self.trust.state is CarTrust.STOPPED
 
     @property
@@ -178,11 +179,11 @@ class PlainStop(Struct):
     """When the next frame of the stop, or its next try, is due."""
     commands: list[Pending]
     is_soft: bool
-    """True for the stop at the end of a drive: after its first frame, a new command may replace it."""
+    """True for the stop at the end of a drive: a new drive may replace it at once, an action after its first frame."""
     index: int = 0
     """Number of this try's frames that are written."""
     last_at: float = float("-inf")
-    """When the first try's last frame was written, or -inf before."""
+    """When the first try's last frame was written, or -inf before. A stop that is repeated begins with a first try."""
     is_late: bool = False
     """True if the car did not show the stop in time. The driver continues to send it."""
 
@@ -557,7 +558,7 @@ class PlainDriver(Driver):
         return stop is None or (stop.is_soft and stop.index > 0) or now >= self._gives_way_at(stop)
 
     def _gives_way_at(self, stop: PlainStop) -> float:
-        """Return when a newer command may replace a stop: its frames are all written, and the car has stopped."""
+        """Return when a newer command may replace a stop: its frames are written, and the car has had time to stop."""
         return stop.last_at + self.STOPS_WITHIN_S if stop.last_at > float("-inf") else float("inf")
 
     def _has_new_motion(self, stop: PlainStop) -> bool:
@@ -627,7 +628,10 @@ class PlainDriver(Driver):
         self._learn(TrustEvent.STOP_BEGUN, now, f"stop ({why})")
 
     def show_rest(self, words: str, now: float) -> None:
-        """End the running stop, because the readings have shown that the car stands still."""
+        """End the running stop if its frames are all written, because readings have shown that the car stands still.
+
+        Without a running stop, the last stop counts as shown.
+        """
         if self._model.shows is not Shows.YES:
             self._model.shows, self._model.shows_words = Shows.YES, f"{self._model.name} has shown a stop: {words}"
         if self._stop is not None and self._stop.last_at > float("-inf"):

@@ -5,9 +5,9 @@ that the yahboom family lacks: a dead-man timer, and on some chassis encoders.
 
 *One number, three meanings.* `{"T":1,"L":0.4,"R":0.4}` is 0.4 m/s on a chassis with encoders, four fifths of full power
 on one without, and nearly nothing on the factory's first program. The command looks the same for all three. So no
-motion is sent before the car's feedback has shown its firmware, and before it has received the number of its chassis
-(`T:900`) from us. On one firmware, a reset clears that number. So after the text of a boot, or a silence in the stream
-of feedback, the car may not be driven until its set-up is repeated.
+motion is sent before the car's feedback has shown its firmware, and before the number of its chassis (`T:900`) was sent
+to it. On one firmware, a reset clears that number. So after the text of a boot, or a silence in the stream of feedback,
+the car may not be driven until its set-up is repeated.
 
 *The dead-man timer.* Three seconds after the last `T:1` the motors stop. But on one firmware, `T:13` drives without
 this timer, so that nothing ever stops the car, and `T:136` with a negative number turns the timer off. So we drive only
@@ -19,15 +19,18 @@ written.
 obeys. But it gives our readings an order: a feedback that arrives after the repeated stop was made after the stop. If
 its wheel speeds are measured, and are zero from then on for a quarter of a second, the car stands still. Measured means
 three things: the chassis has encoders, we have configured the car, and both wheels were seen to turn in a drive of ours
-after that. The last is needed because an encoder with a loose wire reports zero for ever. Any other stop ends as
-`sent`, which claims only that its frames were written, and we rely on the timer.
+after that. The last is needed because an encoder with a loose wire reports zero for ever. The stop of a car that could
+show it, but does not, counts as not confirmed. Any other stop ends as `sent`, which claims only that its frames were
+written, and we rely on the timer.
 
 *Lost settings.* We would not notice a setting that was lost on the link. So the chassis and the dead-man time are sent
-until the car has repeated them. A car that repeats no line gets them three times if its feedback arrives at the
-interval that we asked for, else ten times. Then it may be driven, although it cannot confirm them.
+until the car has repeated them, but at most ten times: three times if it repeats no line, and its feedback arrives at
+the interval that we asked for. Then it may be driven, although it has not confirmed them.
 
 *The first bytes.* At each boot, the car plays a mission that its owner may have stored, and any byte on the UART aborts
-it. So after the link is open we listen first, and wait for the end of a boot. Only a person's stop does not wait.
+it. So after the link is open we listen first, and wait for the end of a boot. A stop that was commanded does not wait,
+unless it joins one whose first frame is written. Our own stop after the opening of the link or a reset waits, and
+another one may.
 
 *Other programs.* The car has a web page with a known password, and accepts commands by radio. Commands of either kind
 reset the dead-man timer. So if wheels turn while our last command is a stop, that is logged, and the car is stopped. No
@@ -84,8 +87,8 @@ CONFIRM_S: Final = 0.3
 """Time within which a car repeats a setting: the longest turn of its loop, and the delay of a slow link."""
 SILENT_TRIES: Final = 3
 BLIND_TRIES: Final = 10
-"""How often the settings are sent to a car that repeats no line. SILENT_TRIES counts if its feedback comes at the
-interval that we set, because that shows that our lines arrive. Otherwise BLIND_TRIES counts."""
+"""How often the settings are sent at most. SILENT_TRIES counts for a car that repeats no line, but whose feedback comes
+at the interval that we set, because that shows that our lines arrive. Otherwise BLIND_TRIES counts."""
 ECHO_TRIES: Final = 3
 """Number of tries of a stop without an echo (a line of ours that the car repeats). After them, the echo counts as
 switched off."""
@@ -282,7 +285,7 @@ class WaveshareDriver(PlainDriver):
             self._listen_on(now)
 
     def _on_answer(self, event: TextLine, now: float) -> None:
-        """Log that another program talks to the car, if the car answers a query that was not ours."""
+        """Log that another program talks to the car, if it soon answers a second query that was not ours."""
         if self._setup is Setup.READY and not _OWN.match(event.raw):
             again, self._answered_at = now < self._answered_at + UNASKED_LOG_S, now
             if again and self.may_log_unasked(now):
@@ -409,12 +412,16 @@ class WaveshareDriver(PlainDriver):
         self._wait_for_setup()
 
     def _wait_for_setup(self) -> None:
-        """Let the gateway's own stop wait for the end of a boot, unless a person asked for it."""
+        """Let the next frame of a stop that no command asked for wait for the end of a boot."""
         if self._stop is not None and not self._stop.commands:
             self._stop.next_at = max(self._stop.next_at, self._setup_at)
 
     def stop(self, why: FrameOrigin, now: float, pending: Any = None) -> None:
-        """Stop the car, also if it is in a mode. A stop that somebody asked for does not wait for the end of a boot."""
+        """Stop the car, also if it is in a mode. A stop that was commanded does not wait for the end of a boot.
+
+        It may wait if it joins a stop whose first frame is written. A stop that was not commanded waits if `tick` is
+        called before its first frame is written.
+        """
         super().stop(why, now, pending)
         if self._stop is not None and self._stop.index == 0:
             self._stop.next_at = now

@@ -22,7 +22,7 @@ def profiles() -> tuple[PlainProfile, ...]:
 
 
 def driver_of(name: str, kept: Mapping[str, Any]) -> "Callable[[Desk], WaveshareDriver]":
-    """Return a function that makes a car's driver. `kept` is not used. Raises ValueError for a wrong platform."""
+    """Return a function that makes a car's driver. `kept` is not used. Raises the errors of `profile_of`."""
     from gateway.drivers.waveshare.driver import WaveshareDriver
 
     del kept

@@ -26,7 +26,10 @@ _DECODER: Final = json.JSONDecoder()
 
 
 class Feedback(Struct, frozen=True):
-    """One report. A field is None if the report does not have it. `at` is the time of the last byte."""
+    """One report. A field is None if the report does not have it, or if its value cannot be used.
+
+    `at` is the time of the last byte.
+    """
 
     raw: bytes
     at: float

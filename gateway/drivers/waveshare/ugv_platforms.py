@@ -43,7 +43,7 @@ _NOT_OBSERVED: Final = ("everything: it was read in the source of the firmwares,
 
 
 def profile_of(name: str) -> PlainProfile:
-    """Return the profile of a platform. Raises ValueError for a wrong name."""
+    """Return the profile of a platform. Raises ValueError for options, and KeyError for a name not in `PLATFORMS`."""
     kind, plus, options = name.partition("+")
     if plus:
         raise ValueError(f'Unknown option "+{options[:40]}" of {kind}, which has no options.')
