@@ -419,12 +419,13 @@ class WaveshareDriver(PlainDriver):
     def stop(self, why: FrameOrigin, now: float, pending: Any = None) -> None:
         """Stop the car, also if it is in a mode. A stop that was commanded does not wait for the end of a boot.
 
-        It may wait if it joins a stop whose first frame is written. A stop that was not commanded waits if `tick` is
-        called before its first frame is written.
+        A stop that was not commanded waits if `tick` is called before its first frame is written.
         """
         super().stop(why, now, pending)
         if self._stop is not None and self._stop.index == 0:
             self._stop.next_at = now
+        elif self._stop is not None and pending is not None:  # it joins a stop that may be waiting
+            self._stop.next_at = min(self._stop.next_at, now + self.STOP_GAP_S)
 
     def tick(self, now: float) -> None:
         """Stop a car that is silent for too long, and set it up again."""

@@ -154,6 +154,23 @@ def test_stop_of_person_does_not_wait_for_boot() -> None:
     assert commands(episode)[0] == {"T": 11, "L": 0, "R": 0, "n": 1}
 
 
+def test_stop_of_person_does_not_wait_for_boot_behind_frames_of_another_stop() -> None:
+    """The link opens during a boot. A fleet-wide e-stop has its first frames out, and then waits for the set-up."""
+    episode = UgvEpisode(1, "ugv_rover", frozen_options=frozenset())
+    episode.car.brown_out(0.0)
+    episode.connect()
+    episode.run(0.05)
+    episode.control.halt("an e-stop of the fleet", episode.now)
+    episode.run(0.5)
+    sent = len(episode.sent)
+    assert sent in (1, 2), "it waits, or the test shows nothing"
+    episode.run(1.0)
+    assert len(episode.sent) == sent
+    episode.ask(Stop())
+    episode.run(0.7)
+    assert len(episode.sent) >= 3
+
+
 def test_ugv_refuses_what_it_lacks_and_lights_work() -> None:
     episode = ready("wave_rover")
     for what in (Led(1, 2, 3), Signal(Verb.WHISTLE), AimServo(1), SetLight(Light.RED), SetMode(Mode.TRACKING)):
