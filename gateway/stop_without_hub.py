@@ -14,6 +14,7 @@ Nothing here reads from the bus or publishes on it.
 import asyncio
 import contextlib
 import logging
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -26,6 +27,7 @@ from gateway.learned_file import LearnedFile
 from gateway.link import Link, LinkError, LinkLost, LinkUrl, open_link
 from gateway.link_loop import at_rate
 from schemas.links import car_link
+from schemas.process import signals
 
 log = logging.getLogger("gateway")
 
@@ -34,8 +36,12 @@ _STOP_POLL_S: Final = 0.05
 
 
 def run_stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:
-    """Run `stop_alone` in an event loop of its own."""
-    return asyncio.run(stop_alone(car, url, platform, fleet, state_dir))
+    """Run `stop_alone` in an event loop of its own. Ctrl-C waits for its end. Then the result is printed at once."""
+    with signals.held_back() as came:
+        words = asyncio.run(stop_alone(car, url, platform, fleet, state_dir))
+        if came:
+            sys.stderr.write(f"gateway: {words}\n")
+    return words
 
 
 async def stop_alone(car: str, url: LinkUrl, platform: str, fleet: str, state_dir: Path) -> str:

@@ -24,6 +24,8 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import json_log
 from schemas.words import Level, Phase, Reason
 
+SAVE_RETRY_S: Final = 1.0
+"""Interval at which a safety state that could not be saved is tried again: the disk may have room again."""
 _LOGGING_LEVELS: Final = {
     Level.DEBUG: logging.DEBUG,
     Level.INFO: logging.INFO,
@@ -62,6 +64,10 @@ class CommandHandler:
         self._estop_sync = estop_sync
         self._save_to_disk = save
         self._saved_safety = control.safety.persisted
+        self._unsaved_safety: PersistedSafety | None = None
+        """The state that could not be saved at the last try."""
+        self._save_at = float("-inf")
+        """When it is tried again."""
         self._longest_drive_s = longest_drive_s
         self._clock = clock
         self._wake = wake
@@ -139,13 +145,17 @@ class CommandHandler:
     def _save(self) -> None:
         """Save a changed safety state."""
         # Save before answering: a person who reads that the e-stop is in force may switch the computer off.
-        safety = self._control.safety.persisted
-        if safety == self._saved_safety:
+        safety, now = self._control.safety.persisted, self._clock()
+        if safety == self._saved_safety or (safety == self._unsaved_safety and now < self._save_at):
             return
-        self._saved_safety = safety
+        was_told, self._unsaved_safety = safety == self._unsaved_safety, safety
         try:
             self._save_to_disk(safety)
+            self._saved_safety, self._unsaved_safety = safety, None
         except OSError as error:
+            self._save_at = now + SAVE_RETRY_S
+            if was_told:
+                return
             words = f"{self._car} will lose its hold and e-stops if its gateway restarts: {error}"
             self.log(Level.ERROR, "not_saved", words)
             lost = f"not saved: {error}"

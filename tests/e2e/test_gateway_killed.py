@@ -3,6 +3,7 @@
 The simulator's truth is the judge, with its own stamps. tests/soak/test_kills.py repeats it with strict limits.
 """
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from fleet.client.client import Fleet as Client
 from tests.support.judge import Judge
 from tests.support.kills import BUSY_S, cut_links
 from tests.support.ports import free_port
-from tests.support.processes import FleetProcesses, driving, wait_for
+from tests.support.processes import FleetProcesses, TcpCar, driving, wait_for
 
 
 @pytest.mark.soak
@@ -70,6 +71,22 @@ def test_gateway_without_hub_stops_car(fleet: FleetProcesses, tmp_path: Path) ->
     assert successor.wait() == 1
     assert not driving(sim)
     assert "red was stopped" in successor.stderr
+
+
+def test_ctrl_c_waits_for_stop_without_hub(fleet: FleetProcesses) -> None:
+    car = TcpCar()
+    try:
+        alone = fleet.start(
+            "-m", "gateway.cli", "run", "--car", "red", "--link", car.link, "--platform", "arduino",
+            "--connect", f"tcp/192.0.2.1:{free_port()}",
+        )  # fmt: skip
+        wait_for(lambda: car.received, "the stop has begun")
+        alone.popen.send_signal(signal.SIGINT)
+        car.obey()
+        assert alone.wait() == 130
+        assert "red was stopped" in alone.stderr
+    finally:
+        car.close()
 
 
 def test_gateway_that_finds_neither_hub_nor_car_says_both(fleet: FleetProcesses) -> None:
