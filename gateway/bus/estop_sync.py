@@ -5,6 +5,7 @@ queries the others. It does not subscribe to their states: with fifty cars, that
 """
 
 import asyncio
+import contextlib
 import logging
 import random
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
@@ -112,8 +113,10 @@ class EstopSync:
 
     def _send_to_all(self, key: str, payload: bytes, encoding: str) -> None:
         """Send a command to all gateways, on a thread. Ignore the answers: each car records its own."""
-        for _ in self._bus.query(key, payload=payload, encoding=encoding):
-            pass
+        # Without a link, the others learn of it when this gateway is back (`keep_synced`).
+        with contextlib.suppress(bus.BusError):
+            for _ in self._bus.query(key, payload=payload, encoding=encoding):
+                pass
 
     async def keep_synced(self, merge: MergeSafety) -> None:
         """Merge the fleet-wide e-stops and the pauses of each gateway that starts, until cancelled."""

@@ -321,9 +321,11 @@ class Controller(Generic[D_co]):
             which = " ".join(estop.id for estop in ended)
             self._log.log(Level.WARNING, "estop_ended", f"e-stop {which} was ended by {sender.name}", now)
         parts = []
-        if resume.ids or ended:
-            count = len(ended) if resume.all else len(named)
+        # A copy of this command from another gateway may have ended some before (`EstopSync.forward`).
+        if count := len({*named} & {*safety.ended}):
             parts.append("e-stop released" if count == 1 else f"{count} e-stops released")
+        elif resume.ids:
+            parts.append("no e-stop released")
         hold = safety.hold
         if not resume.ids and authority.denies(sender, Right.RESUME) is None:
             parts.append(f"resumed: the hold by {name_of(hold.by)} has ended" if hold else "resumed: was not on hold")
@@ -483,6 +485,7 @@ class Controller(Generic[D_co]):
 
     def _prolong_drive(self, held: HeldMotion, pending: Pending, duration_s: float, now: float) -> Answer:
         """Set the end of a held motion anew without another frame, because its sender has sent the same drive again."""
+        is_shorter = now + duration_s < held.expires_at
         if held.pending.sent:
             held.expires_at = now + duration_s
         else:
@@ -491,7 +494,7 @@ class Controller(Generic[D_co]):
         if pending.command.streamed:
             return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)
         if held.pending.sent:
-            return self._done(pending, "the running drive was extended", now)
+            return self._done(pending, f"the running drive was {'shortened' if is_shorter else 'extended'}", now)
         self._log.record(
             held.pending,
             Phase.SUPERSEDED,

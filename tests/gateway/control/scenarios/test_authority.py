@@ -67,6 +67,13 @@ def test_hold_outlives_estop(desk: Workbench) -> None:
     assert desk.ask(FORWARD, PERSON).status is QUEUED
 
 
+def test_resume_counts_only_estops_that_have_ended(desk: Workbench) -> None:
+    desk.ask(EmergencyStop("x"), PERSON, identity="e1")
+    desk.ask(EmergencyStop("y"), PERSON, identity="e2")
+    assert desk.ask(Resume(("e1", "e9")), PERSON).words.startswith("e-stop released; still emergency-stopped by mia")
+    assert desk.ask(Resume(("e1",)), PERSON).words.startswith("e-stop released; "), "a copy of the same command"
+
+
 def test_several_e_stops_in_force_are_named_by_their_ids(desk: Workbench) -> None:
     desk.ask(EmergencyStop("smoke"), PERSON, identity="e1")
     desk.ask(EmergencyStop(), BOB, identity="e2")
