@@ -372,7 +372,7 @@ class WaveshareDriver(PlainDriver):
         model.turned_at = event.at if any(turning) else model.turned_at
         if model.motors is Motors.ON:
             self._turned = [seen or turns for seen, turns in zip(self._turned, turning, strict=True)]
-        self._check_stuck(turning, now)
+        self._check_stuck(event, now)
         stands = event.left_m_s == 0.0 and event.right_m_s == 0.0
         if stands and self._stands_since is not None and event.at > self._stands_since:
             self._stands += 1
@@ -386,11 +386,15 @@ class WaveshareDriver(PlainDriver):
         elif not stands and self._stands_since is not None:
             self._stands, self._stands_since = 0, event.at
 
-    def _check_stuck(self, turning: list[bool], now: float) -> None:
+    def _check_stuck(self, event: Feedback, now: float) -> None:
         """End a drive in which a wheel stands still, because the speed control adds power until the wheel turns."""
         held, model = self.queue.held, self._model
-        drives = model.motors is Motors.ON and held is not None and held.began_at is not None
-        if not drives or all(turning):
+        turning = []
+        if model.motors is Motors.ON and held is not None and held.began_at is not None:
+            # In a slow curve, the inner wheel shall turn no faster than a wheel that counts as turning.
+            speeds = zip((event.left_m_s, event.right_m_s), self._speeds(held.motion), strict=True)
+            turning = [abs(speed) >= min(TURNS_M_S, abs(wanted) / 2) for speed, wanted in speeds]
+        if all(turning):
             self._stuck_since = None
             return
         self._stuck_since = now if self._stuck_since is None else self._stuck_since
@@ -501,9 +505,14 @@ class WaveshareDriver(PlainDriver):
 
     def motion_frame(self, motion: Motion) -> bytes:
         """Return the line of a motion. No number in it exceeds FULL_SPEED."""
+        left, right = self._speeds(motion)
+        return line(DRIVE, L=left, R=right)
+
+    def _speeds(self, motion: Motion) -> tuple[float, float]:
+        """Return the commanded speeds of the left and the right wheels."""
         speed = min(FULL_SPEED, max(0.0, FULL_SPEED * self._model.speed))
         left, right = (round(speed * share, 3) for share in _SIDES[motion])
-        return line(DRIVE, L=left, R=right)
+        return left, right
 
     def on_written(self, write: OutgoingFrame, now: float) -> None:
         """Update the state, and note when a motion was last sent."""

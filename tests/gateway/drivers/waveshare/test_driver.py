@@ -5,13 +5,16 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
-from gateway.control.commands import AimServo, Drive, EmergencyStop, Led, SetLight, SetMode, Signal, Stop
+from gateway.control.commands import AimServo, ChangeSpeed, Drive, EmergencyStop, Led, SetLight, SetMode, Signal, Stop
+from gateway.control.driver import Event
 from gateway.drivers.waveshare import driver as waveshare
+from gateway.drivers.waveshare.feedback_parser import Feedback
 from gateway.drivers.waveshare.ugv_platforms import FULL_SPEED
 from gateway.sim.model.ir_remote import Button
 from schemas.commands import Verb
-from schemas.words import Basis, CarTrust, Light, Mode, Motion, Motors, Phase, Reason, Shows
+from schemas.words import Basis, CarTrust, Light, Mode, Motion, Motors, Phase, Reason, Shows, SpeedStep
 from tests.fuzz.ugv_search import SETTLED_S, UgvEpisode
 
 
@@ -141,6 +144,30 @@ def test_wheel_without_encoder_signal_ends_drive_as_stuck() -> None:
     episode.run(2.0)
     assert not episode.car.truth.driving
     assert [each.reason for each in episode.records if each.phase is Phase.FAILED] == [Reason.STUCK]
+
+
+@pytest.mark.parametrize(("share", "reasons"), [(0.95, []), (0.0, [Reason.STUCK])])
+def test_slow_inner_wheel_of_a_curve_is_not_stuck(share: float, reasons: list[Reason]) -> None:
+    """At the lowest speed it shall turn at 0.02 m/s. This car's wheels turn a little slower, or the inner one not."""
+    episode = ready("ugv01")
+    for _ in range(10):
+        episode.ask(ChangeSpeed(SpeedStep.DOWN))
+        episode.run(0.5)
+    driver = episode.control.driver
+    parse = driver.feed
+
+    def feed(data: bytes, now: float) -> list[Event]:
+        return [
+            replace(each, left_m_s=each.left_m_s * share, right_m_s=each.right_m_s * 0.95)
+            if isinstance(each, Feedback)
+            else each
+            for each in parse(data, now)
+        ]
+
+    driver.feed = feed  # type: ignore[method-assign]  # another car
+    episode.ask(Drive(Motion.LEFT, 4.0))
+    episode.run(6.0)
+    assert [each.reason for each in episode.records if each.phase is Phase.FAILED] == reasons
 
 
 def test_stop_of_person_does_not_wait_for_boot() -> None:
