@@ -130,7 +130,7 @@ export const t = {
   pauseMeans: "all stop and wait",
   estopMeans: "all stop, locked",
   pauseEffect: "All cars stop. Nobody but a lead moves one, until the pause is ended.",
-  estopEffect: "All cars stop, and take no command but stops, until somebody ends the e-stop of each car on the page Fleet.",
+  estopEffect: "All cars stop, and take no command but stops, until somebody ends the e-stop on the page Fleet: at one car, for all.",
   stopCar: "Stop",
   estop: "E-stop…",
   estopNow: "E-stop all cars now",

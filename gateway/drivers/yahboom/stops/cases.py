@@ -174,7 +174,7 @@ NO_ECHO: Final = StopCase(
 )
 FAN: Final = StopCase(
     "fan",
-    "full stop or recovery while the fan runs (not Raspberry Pi)",
+    "full stop or recovery while the fan of an Arduino car runs",
     "",
     "`sent`; then the whole stop every 6 s",
     "{car} sends nothing while its fan runs",
