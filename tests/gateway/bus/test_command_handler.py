@@ -13,7 +13,7 @@ from gateway.control.safety_state import PersistedSafety
 from schemas.rights import Sender
 
 
-class Log:
+class CollectedLog:
     """The log of a gateway, without a bus. Everything else of a publisher is not needed here."""
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class Log:
 
 @pytest.mark.parametrize("failures", [1, 3])
 def test_estop_that_could_not_be_saved_is_saved_when_the_disk_has_room(failures: int) -> None:
-    now, saved, tries, log = 0.0, list[PersistedSafety](), 0, Log()
+    now, saved, tries, log = 0.0, list[PersistedSafety](), 0, CollectedLog()
 
     def save(safety: PersistedSafety) -> None:
         nonlocal tries
