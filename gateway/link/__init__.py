@@ -43,7 +43,9 @@ def kind_of(scheme: str) -> LinkKind[Any]:
 
 
 async def open_link(url: LinkUrl, *, timeout_s: float | None = None, first: bool = False) -> Link:
-    """Open the link within this time. Raises CannotOpen, with a message that says what is wrong and what to do.
+    """Open the link. Raises CannotOpen, with a message that says what is wrong and what to do, or ImportError.
+
+    `timeout_s` is for the whole opening, but with Bluetooth only for the search. Connecting has its own timeout.
 
     Gateways connect one after the other through a Bluetooth adapter. With `first`, this car may be moving, so it goes
     first.

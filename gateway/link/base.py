@@ -35,12 +35,16 @@ class Link(ABC):
     async def write(self, data: bytes) -> None:
         """Send these bytes, with nothing between them. Raises LinkLost if the link does not accept them.
 
-        Serial and TCP send them in a single write, without waiting. Bluetooth sends them in pieces, within a second.
+        Serial and TCP send them in a single write, without waiting (serial on Windows: up to 0.25 s). Bluetooth sends
+        them in pieces, within a second.
         """
 
     @abstractmethod
     async def close(self) -> None:
-        """Release the port within CLOSE_S. Pending reads and writes raise LinkLost. It may be called again."""
+        """Release the port within CLOSE_S (Bluetooth: 4 s). It may be called again.
+
+        Pending reads and writes raise LinkLost.
+        """
 
 
 class Device(ABC):

@@ -1,8 +1,8 @@
 """A car's Bluetooth LE module through bleak: finds the device and its characteristics, and writes frames in pieces.
 
-The link is lost when the system reports a disconnect, or when a write fails. The caller judges whether a silent car is
-lost. bleak's `is_connected` is not used, because it stays true when the system's Bluetooth service dies. bleak's
-clean-up has no timeout, so its calls run in a task that is cancelled again and again until it ends.
+The link is lost when the system reports a disconnect, a write fails, or too many bytes wait. The caller judges whether
+a silent car is lost. bleak's `is_connected` is not used, because it stays true when the system's Bluetooth service
+dies. bleak's clean-up has no timeout, so its calls run in a task that is cancelled again and again until it ends.
 """
 
 import asyncio
@@ -157,7 +157,7 @@ class BleLink(BufferedLink):
         return address.upper() == self._url.address if self._url.name is None else self._url.name in names
 
     async def _find(self, known: Mapping[str, _Devices], adapters: Sequence[str | None]) -> _Devices:
-        """Scan until the device advertises. If only its name is known, scan on for others of that name. No timeout."""
+        """Scan until the device advertises. Scan on for others of its name, or for its other adapters. No timeout."""
         loop = asyncio.get_running_loop()
         found, others = {address: dict(devices) for address, devices in known.items()}, dict[str, str]()
         self._stage = _not_found(self._url, others)

@@ -1,8 +1,8 @@
 """A serial port through pyserial. One thread finds, opens and closes the port, because these calls can block.
 
 The event loop reads and writes. On Windows it cannot watch a port, so the thread reads as well.
-A write never waits. A port can buffer far more than one frame. So a port that does not accept a whole frame at once is
-stuck, and the link counts as lost.
+A write never waits (on Windows, it waits up to 0.25 s). A port can buffer far more than one frame. So a port that does
+not accept a whole frame at once is stuck, and the link counts as lost.
 Every use of the descriptor needs `_lock`, because the thread may close a dead port at any moment. Another car's port
 may get the same descriptor number a moment later.
 """
@@ -30,7 +30,7 @@ from schemas.process.usb_bus import explain_missing_port
 SERIAL_WRITE_TIMEOUT_S: Final = 0.25
 """Timeout of pyserial's own write, used on Windows only."""
 MAX_BUFFERED_CHUNKS: Final = 256
-"""Maximum number of buffered chunks. At this number, the link stops reading the port."""
+"""Number of buffered chunks. At the next one, the link stops reading the port."""
 READ_BYTES: Final = 4096
 CAN_WATCH: Final = os.name == "posix"
 """True if the event loop can watch the port."""
@@ -427,7 +427,7 @@ def _cause(error: Exception) -> str:
 
 
 def _device(path: str, *, required: bool) -> ListedPort | None:
-    """Return the USB port at this path, or None if there is none.
+    """Return the listed port at this path, or None if there is none.
 
     If the system cannot list the ports, return None as well. Raises CannotOpen instead if the port is `required`.
     """

@@ -1,4 +1,7 @@
-"""A TCP connection to a car or a bridge. Each frame is one write. The link never puts two frames into one segment."""
+"""A TCP connection to a car or a bridge. Each frame is one write, sent at once.
+
+If the network loses a segment, the system may join the frames of two writes when it sends them again.
+"""
 
 import asyncio
 import contextlib
@@ -52,7 +55,7 @@ class TcpLink(asyncio.Protocol, BufferedLink):
         return data
 
     async def write(self, data: bytes) -> None:
-        """Send these bytes in a segment of their own. Raises LinkLost if the connection is gone or stuck."""
+        """Send these bytes at once, in a write of their own. Raises LinkLost if the connection is gone or stuck."""
         transport = self._transport
         if transport is not None and self._lost is None and transport.is_closing():
             await self._ended.wait()  # connection_lost sets the reason

@@ -5,7 +5,7 @@ from schemas.links import BadLink, LinkUrl, parse_link
 
 
 def parse_url(text: str) -> LinkUrl:
-    """Return the link with this URL or bare device path. Raises BadUrl if it is not a link."""
+    """Return the link with this URL or bare device path. Raises BadUrl if it is none, or if a package is missing."""
     try:
         url = parse_link(text)
     except BadLink as error:

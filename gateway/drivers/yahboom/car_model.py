@@ -1,6 +1,7 @@
 """The estimates of one car: platform, mode, battery, outputs, trust, and evidence of a stop. Nothing is decided here.
 
-`Executor` updates it with each written frame, `CarMonitor` with each reading.
+`Executor` updates it with each written frame, `CarMonitor` with each reading and silence, `StopExecutor` with each
+stop.
 """
 
 from dataclasses import dataclass, field, replace
@@ -105,7 +106,7 @@ class CarModel:
 
     @property
     def shows(self) -> Shows:
-        """Return whether the reports of the car were seen to react to frames."""
+        """Return whether the reports of the car show its stops, as far as that is known."""
         return self.learned.shows
 
     @property
@@ -129,7 +130,7 @@ class CarModel:
 
     @property
     def manual(self) -> bool:
-        """Return True if mode 0 was commanded last, and no reading contradicts it."""
+        """Return True if mode 0 was commanded last, and neither readings nor silence contradict it."""
         return self.mode.asked is Mode.MANUAL and self.mode.verdict is not Verdict.CONTRADICTED
 
     @property
@@ -165,7 +166,7 @@ class CarModel:
 
     @property
     def is_deaf(self) -> bool:
-        """Return True if the car could have shown a stop, and has not reacted to the last one yet."""
+        """Return True if the car can show a stop, but never reacted on this link, or did not show the last one."""
         shows = self.can_show and self.stop_style is StopStyle.MODE_FRAME
         return shows and self.evidence.reacted_at is None and not self.evidence.without_echo
 
@@ -180,7 +181,7 @@ class CarModel:
 
     @property
     def silent_program(self) -> str:
-        """Return a sentence on what to do about a car that never sent a reading. Empty if it has sent one."""
+        """Return what to do about a car that never sent a reading. Empty if it has, or if its profile expects none."""
         if self.mode.heard_at > float("-inf") or not self.profile.has_readings:
             return ""
         if self.profile.kind is not Platform.UNKNOWN:
@@ -207,7 +208,7 @@ class CarModel:
 
     @property
     def basis(self) -> Basis | None:
-        """Return the basis of the claim that the motors are off, or None if they are not."""
+        """Return the basis of the claim that the motors are off, or None if there is no such claim."""
         return self.trust.basis if self.motors is Motors.OFF else None
 
     @property
@@ -271,7 +272,7 @@ class CarModel:
         return max(self.pacing.flight_until, self.mode_left_by)
 
     def is_awake(self, now: float) -> bool:
-        """Return True if the car reads a frame at once, because it is in no block, neither a known nor a possible one.
+        """Return True if no frame of ours blocks the car any more. A ranging without an echo may still delay it.
 
         In a block, the program of the car is busy, and reads nothing.
         """

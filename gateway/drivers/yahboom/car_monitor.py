@@ -35,12 +35,12 @@ FAN_SETTLED_S: Final = 2.0
 
 
 class CarMonitor:
-    """Handles readings, silence, and stalls of the loop."""
+    """Handles readings, silence, and changes of the detected platform."""
 
     def __init__(self, model: CarModel, executor: Executor, log: CommandLog) -> None:
         self.model = model
         self.lost_frames = 0
-        """Number of `MODE00` frames that did not arrive, as the car's reports show."""
+        """Number of judged `MODE00` frames that did not arrive. Counted only on a car that has shown a stop before."""
         self._executor = executor
         self._stops = executor.stops
         self._log = log

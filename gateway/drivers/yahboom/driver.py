@@ -53,7 +53,7 @@ class YahboomDriver(Executor):
 
     @property
     def lost_frames(self) -> int:
-        """Return the number of `MODE00` frames (back to mode 0) that did not reach the car, as its reports show."""
+        """Return the number of `MODE00` frames that were lost, as the reports of a car that has shown stops say."""
         return self._monitor.lost_frames
 
     # ------------------------------------------------------------------ bytes in
@@ -120,7 +120,10 @@ class YahboomDriver(Executor):
         super().on_stall(gap_s, now)
 
     def on_sleep(self, slept_s: float, now: float) -> None:
-        """Stop the car after a sleep of the computer, and do not count that time as a silence of the car."""
+        """Stop the car after a sleep of the computer, unless it has shown that it stands still.
+
+        Do not count that time as a silence of the car.
+        """
         self.model.evidence.reset_times()
         self.model.mode.excuse_silence(now)
         super().on_sleep(slept_s, now)
@@ -238,7 +241,10 @@ class YahboomDriver(Executor):
 
     @property
     def opened_as(self) -> str:
-        """Return the platform of the car if a mode that the gateway began may still run, else an empty text."""
+        """Return the detected platform if a mode that the gateway began may still run.
+
+        Else return an empty text, also if the platform was not detected but configured.
+        """
         return self.model.learned.opened_as
 
 

@@ -1,4 +1,4 @@
-"""Sends frames to one car: one at a time, a stop before everything else. Pure.
+"""Sends frames to one car: one at a time, the first frames of a stop before everything else. Pure.
 
 `StopExecutor` knows which frames a stop needs, `CommandQueue` has the other waiting commands, and `Pacing` knows when a
 frame may be written.
@@ -383,9 +383,9 @@ class Executor(Driver):
             model.mode.on_mode_sent(Mode.MANUAL, now=now, block_s=block_s)
 
     def _doubt_rest(self, now: float) -> None:
-        """Claim no longer that the car has shown its stop, because it may read half of a named frame as a motion.
+        """Claim no longer that the car has shown its stop, because it got another frame after it.
 
-        A named frame has words, such as `$4WD,PTZ90#` (docs/reference/protocol.md#hazards).
+        A link that loses bytes can turn that frame into a motion (docs/reference/protocol.md#hazards).
         """
         self.model.rest_case = cases.ACTED
         words = cases.ACTED.why(self.model.name)
@@ -399,7 +399,7 @@ class Executor(Driver):
     # ------------------------------------------------------------------ stops
 
     def shut_down(self, now: float) -> None:
-        """Stop the car, and reject all later commands, because the gateway ends."""
+        """Drop all commands and stop the car, unless it has shown that it stands still. The gateway ends."""
         if self.stops.shutting_down:
             return
         self.queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, "the gateway is ending", now)

@@ -9,17 +9,18 @@ nobody sent. Most of the hazards in docs/reference/protocol.md have this cause.
 So a frame should be alone in the buffer when the car reads it. The difficulty is that the car does not say when it
 reads. `Pacing` estimates two times for the last frame. Its *flight* is the time during which it is certainly under way:
 60 ms, or its own block if that is longer. The time by which it is *read* is a worst case. If the last report shows that
-the car is awake, the car reads the frame at once, else after the longest ranging. Both times are later by the block of
-any frame that waited before it. A report that was sent after the write shows that the loop has read the buffer, so the
-time becomes earlier.
+the car is awake, the car reads the frame at once, else after the longest ranging. Neither is earlier than the end of
+the block of a frame that waited before it. A report that was sent after the write shows that the loop has read the
+buffer, so the time becomes earlier.
 
 Callers say how careful they must be (`Gate`). A stop waits only for the flight, because a stop that waits for certainty
 is late, and its repetitions make up for lost frames. A frame that opens a mode, or that must not be read behind another
 frame, waits until it is alone. Blocks that are only possible never delay a stop, but they delay everything that can
 wait.
 
-How long frames block is learned from each car (`Learned`), because programs and boards differ. The expected times are
-used only until then. This module knows frames and times, but no commands: `Executor` decides which frame is written.
+How long frames block is learned from each car (`Learned`), because programs and boards differ. But a block
+that is shorter than expected does not count here. This module knows frames and times, but no commands: `Executor`
+decides which frame is written.
 """
 
 from enum import IntEnum
@@ -46,7 +47,7 @@ AWAKE_WAIT_S: Final = 1.25
 # and the two together can start the car (docs/reference/protocol.md#programs-that-people-have). So leave time for 20 ms
 # on the wire, 60 ms, and one report of 48 ms.
 NAMED_GAP_S: Final = 0.13
-"""Minimum time from any frame to a named one, which has words, such as `$4WD,PTZ90#`."""
+"""Minimum time from any frame but a lone `#` to a named one, which has words, such as `$4WD,PTZ90#`."""
 
 
 class Gate(IntEnum):
@@ -195,5 +196,5 @@ class Pacing:
 
     @property
     def repeat_at(self) -> float:
-        """Return the earliest time for a repetition: `REPEAT_INTERVAL_S` after the last frame, and after its block."""
+        """Return the earliest time for a repetition: `REPEAT_INTERVAL_S` after the last frame, but not in its block."""
         return max(self._written_at + REPEAT_INTERVAL_S, self.flight_until)

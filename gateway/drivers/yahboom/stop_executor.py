@@ -143,7 +143,7 @@ class StopExecutor:
             self._end_unstopped(f"is unreachable ({reason})", now)
 
     def shut_down(self, now: float) -> None:
-        """Stop the car for the last time."""
+        """Stop the car for the last time, unless it has shown that it stands still."""
         self.shutting_down = True
         self._shutdown_until = now + SHUTDOWN_S
         if not self.model.link_open:
@@ -153,7 +153,7 @@ class StopExecutor:
 
     @property
     def finished(self) -> bool:
-        """Return True after `shut_down` if the stop is over, or the car did not show it in time."""
+        """Return True after `shut_down` if the stop is over or was given up: not shown in time, or the link is down."""
         return self.shutting_down and self.running is None
 
     def is_shutdown_over(self, now: float) -> bool:
@@ -202,7 +202,7 @@ class StopExecutor:
             self._try_again(running, now)
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
-        """Return the case with which the stop ends as sent. None if the car may still show it."""
+        """Return the case with which the stop ends as sent. None if it does not end now."""
         if running.at_rest or self.model.trust.state is CarTrust.UNHEARD:
             return None
         facts = self._facts(running, now)
@@ -245,9 +245,12 @@ class StopExecutor:
         self.model.evidence.on_retry()
 
     def fail_late(self, running: StopInProgress, now: float) -> None:
-        """Fail the commands that have waited too long for evidence. Continue the stop."""
+        """Fail the commands that have waited too long for evidence, and continue the stop.
+
+        But if it is not known whether the reports of the car show stops, end the stop as sent.
+        """
         if self.model.evidence.settles_at is not None:
-            return  # the silence that shows the stop takes 2 s at most
+            return  # wait for the end of the silence that shows the stop
         car = self.model.name
         is_late = any(now >= pending.received_at + running.timeout_s for pending in running.commands)
         if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._never_reacted(running):
@@ -276,12 +279,12 @@ class StopExecutor:
                 self._log.log(Level.WARNING, "unheard", words, now)
 
     def _never_reacted(self, running: StopInProgress) -> bool:
-        """Return True if the car has reported in mode 0 since the stop, and was never seen to react to a frame."""
+        """Return True if the car has reported in mode 0 since the stop began, but may be one that cannot show stops."""
         is_unknown = self.model.learned.shows is Shows.UNKNOWN
         return is_unknown and running.report_at > running.began_at and self.model.is_heard
 
     def _finish_unknown(self, running: StopInProgress, now: float) -> None:
-        """End, as sent, the stop of a car that reports in mode 0 and was never seen to react to a frame."""
+        """End, as sent, the stop of a car of which it is not known whether its reports show stops."""
         self._finish(running, Basis.SENT, cases.NOT_KNOWN.why(self.model.name), now, cases.NOT_KNOWN)
 
     def end_doubt(self, now: float) -> None:
@@ -366,7 +369,8 @@ class StopExecutor:
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once, because the reports have continued without a block gap.
 
-        The case of the stop decides whether to do so, because the reports of a Raspberry Pi always continue.
+        Do so only in the first try, and only if the case of the stop allows it: the reports of a Raspberry Pi always
+        continue.
         """
         running.probes += 1
         if (
@@ -384,7 +388,7 @@ class StopExecutor:
     def _finish(
         self, running: StopInProgress, basis: Basis, words: str, now: float, case: StopCase = cases.MANUAL
     ) -> None:
-        """End the stop, because the car has shown it, or cannot show it."""
+        """End the stop, as shown or as sent."""
         model, shown = self.model, basis is Basis.SHOWN
         self.running = None
         recovered = model.trust.state in STOP_GOES_ON and not model.known

@@ -28,7 +28,7 @@ class StopRenewal:
         self._count = 0
         self._next_at = float("inf")
         self._cleared_at = float("-inf")
-        """When the last renewal by `MODE00` was written."""
+        """When the last renewal began."""
         self._general_stop_follows = False
         """True if the last renewal was a `MODE00`. A car without modes ignores it, so a general stop must follow."""
 

@@ -6,15 +6,15 @@ So a car must not be judged by the numbers of another program. It is compared wi
 
 A *rhythm* is the interval of undisturbed reports: the last few intervals, their median and their spread. If the link
 loses or holds a report, the interval is wrong, so an interval is added to the rhythm only if it fits the others. If
-three in a row fit each other but not the rhythm, they are a new rhythm: the car runs another program, or it is another
-car.
+three in a row (two, if only one interval is known) fit each other but not the rhythm, they are a new rhythm: the car
+runs another program, or it is another car.
 
 A *delay* is how much later than the rhythm a report comes after one frame that may block the car. The delay is the only
 acknowledgement of the frame. A car that reports by a timer is never late, so it acknowledges nothing.
 
 The finding that a car cannot show a stop needs more than a first impression: `UNREACTED` blocking frames without any
 delay, and none with a delay. It is withdrawn after `REACTED` delays that are as long as the block of a frame. No frame
-is sent only to learn. `Learned.kept` and `Learned.restore` preserve all of this over a restart.
+is sent only to learn. `Learned.kept` and `Learned.restore` preserve the results over a restart, but not the counts.
 """
 
 from collections import deque
@@ -31,7 +31,8 @@ from schemas.words import Blocking, Mode, Shows
 KEPT_INTERVALS: Final = 9
 """Maximum number of intervals of a rhythm. The newest count."""
 SAME_S: Final = 0.18
-"""Maximum difference of intervals that belong to one rhythm. Intervals of one car are up to 0.08 s from their mean."""
+"""Maximum difference of an interval from the median of its rhythm. Intervals of one car are up to 0.08 s from their
+mean."""
 FIRM_INTERVALS: Final = 4
 """Minimum number of intervals to know their spread."""
 FIRST_TOLERANCE_S: Final = 0.12
@@ -39,7 +40,7 @@ FIRST_TOLERANCE_S: Final = 0.12
 LINK_TOLERANCE_S: Final = 0.05
 """Tolerance for the link and the machine, in addition to the spread."""
 CHANGED_INTERVALS: Final = 3
-"""Number of consecutive intervals that make a new rhythm."""
+"""Number of consecutive intervals that replace a rhythm. Two replace a rhythm of one interval."""
 AGREEING_DELAYS: Final = 3
 """Number of consecutive equal delays that count as the block of a frame."""
 ALWAYS: Final = 5
@@ -54,7 +55,7 @@ became the rhythm, as the first interval does, each stop would wait that long fo
 
 
 def blocking_kind(frame: Frame) -> Blocking | None:
-    """Return the kind of a frame that may block. None if the frame never blocks, or blocks in several ways."""
+    """Return the kind of a frame that may block. None if it never blocks, or if its block is not learned."""
     match frame:
         case ModeClose():
             return Blocking.MODE_CLOSE
@@ -153,11 +154,12 @@ class Learned(Struct):
     """True if the car has shown its stops before, and did not show the last one."""
     opened_as: str = ""
     """The platform that was detected when the gateway last opened a mode, until a report shows mode 0 again. In a
-    silent mode, only this tells the next gateway how to end the mode. Empty if no mode is open."""
+    silent mode, only this tells the next gateway how to end the mode. Empty if no mode is open, or if the platform is
+    configured."""
     reporting: set[Mode] = field(default_factory=set)
     """The modes in which the car has sent readings."""
     extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """The lowest and the highest accepted value of each field with a number, as on the wire."""
+    """The lowest and the highest accepted value of each field, as on the wire. 0 and 1 for a field of bits."""
     rejected: dict[str, int] = field(default_factory=dict)
     """How often the value of a field was out of its range, by the word of the field."""
     _delays: dict[Blocking, deque[float]] = field(default_factory=dict)

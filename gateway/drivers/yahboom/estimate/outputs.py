@@ -14,7 +14,7 @@ from schemas.words import Motion
 
 @dataclass(slots=True)
 class StateEstimate:
-    """The effect of all frames written since the link was opened. Times: s, monotonic."""
+    """The effect of all frames written since the gateway began (fan: since the link opened). Times: s, monotonic."""
 
     profile: Profile
     motion: Motion = Motion.STOP

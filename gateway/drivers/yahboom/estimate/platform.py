@@ -24,7 +24,8 @@ EVIDENCE_FRAMES: Final = 3
 OTHER_PROGRAM_FRAMES: Final = 12
 """Number of consecutive frames of another program, or with another head (first word of a frame), after which the car
 counts as one with that program or head. The number is high for two reasons. A link that loses or changes bytes makes
-such a frame now and then. And with a wrong head or platform, the car ignores every frame of ours that has a head."""
+such a frame now and then. And with a wrong head or platform, the car ignores every frame of ours that has a head. If no
+frame with the head of the profile has arrived on this link, `EVIDENCE_FRAMES` with another head are enough."""
 
 _MODE_READINGS: Final = "readings of a mode other than 0, which raspberry_pi cars do not have"
 _MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspberry_pi cars do not send"
@@ -87,7 +88,7 @@ class PlatformDetector:
     """Number of frames that show an option, by option."""
     _open_mode: _PlatformEvidence = field(default_factory=_PlatformEvidence)
     _extra_options: set[str] = field(default_factory=set)
-    """Contradictions that show no more than an option which is not configured."""
+    """Contradictions that do not make the kind of the stop doubtful, such as an option that is not configured."""
     _readings: int = 0
     _assumed_silent: bool = False
     """True if the option `no_readings` of the profile comes from the silence of this link."""
@@ -109,7 +110,7 @@ class PlatformDetector:
 
     @property
     def doubted(self) -> bool:
-        """Return True if readings contradict the profile now. A missing option is not a contradiction."""
+        """Return True if readings contradict the profile now. Contradictions by `note` do not count."""
         return any(
             shown.holds for words, shown in self._found_contradictions.items() if words not in self._extra_options
         )
@@ -212,7 +213,7 @@ class PlatformDetector:
             self._apply_evidence()
 
     def _check_profile(self, event: Sensors) -> tuple[str, ...]:
-        """Update the contradictions of the profile. Only a frame of mode 0 can end a contradiction in mode 0."""
+        """Update the contradictions of the profile. Only frames of mode 0 can end one."""
         observed = self.profile.contradictions(event)
         if not observed and not self._found_contradictions:
             return ()

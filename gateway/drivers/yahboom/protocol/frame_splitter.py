@@ -1,8 +1,8 @@
 """Finds the frames in a car's bytes: bytes in any pieces go in, events come out. No I/O, no clock.
 
-Work is linear, and memory is bounded: the buffer has at most `max_frame` bytes and is never searched twice. Every
-byte is in the `raw` of exactly one event, with two harmless exceptions: separators (CR, LF, space, tab) between frames,
-and a late `#` after a frame that a silence has ended.
+Work is linear, and memory is bounded: the buffer has at most `max_frame` bytes. Every byte is in the `raw` of
+exactly one event, with two harmless exceptions: separators (CR, LF, space, tab) between frames, and a late `#` after a
+frame that a silence has ended.
 A whole line of text between frames is an event. Other junk is one event for each run of up to `max_frame` bytes. After
 an overlong frame, everything up to the next `$` is junk.
 

@@ -180,7 +180,7 @@ class Profile(Struct, frozen=True, dict=True):
 
     @property
     def dead_man_s(self) -> None:
-        """Always None, because no such car stops by itself (docs/reference/protocol.md#stops)."""
+        """Always None: no such car is certain to stop by itself (docs/reference/protocol.md#general-frame)."""
         return None
 
     @cached_property
@@ -248,7 +248,7 @@ class Profile(Struct, frozen=True, dict=True):
         return parse_sent(data, self.dialect)
 
     def refusal(self, frame: Frame) -> str | None:
-        """Return a sentence on why the car must not get this frame. None if the car understands the frame."""
+        """Return a sentence on why the car must not get this frame. None if it may get the frame."""
         match frame:
             case General():
                 return self._general_refusal(frame)

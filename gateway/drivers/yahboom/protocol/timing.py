@@ -27,7 +27,7 @@ LONGEST_BLOCK_S: Final = max(row.open_s for row in MODES.values())
 # Stopping, recovery: after the longest block and a margin of 0.2 s, the last `MODE00` is alone in the car's buffer.
 # It is computed, so that the recovery waits longer if a mode opens more slowly.
 RECOVERY_SILENCE_S: Final = round(LONGEST_BLOCK_S + 0.2, 3)
-"""Time from the first frame of a recovery to its last `MODE00`."""
+"""Time from the first frame of a recovery to its last `MODE00`, or to the color frame if it has one."""
 REPEAT_INTERVAL_S: Final = 1.1
 """Minimum interval of two frames after which each is alone in the car's buffer: an unknown block takes up to 1.0 s."""
 

@@ -26,7 +26,7 @@ class StopFacts(Struct, frozen=True):
     frames_sent: bool
     """All frames of this try are written."""
     sent_all: bool
-    """All frames of the first try are written, or a report has arrived after its `MODE00`."""
+    """All frames of a try are written, or a report has arrived after the block of its `MODE00`."""
     is_time_up: bool
     """By now the car has obeyed, if the frames arrived."""
     reported: bool

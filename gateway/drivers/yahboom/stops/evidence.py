@@ -38,11 +38,11 @@ intervals differ. So if that report is missing or damaged, the link made the blo
 The next one comes on time, so the interval between the two is too short. Therefore the last block gap counts only after
 the time in which that next report would have come.
 
-*Modes.* If a car reports in a mode, the form of its next report shows that it left the mode. On a car that was seen to
-block, one report is enough, if it comes at the right time. It must not come too early: the car must have begun this
-report after it obeyed `MODE00`. And it must not come too late: if `MODE00` lost its digits on the way, the car opens
-mode 0 with the motors on, and that blocks it for longer. The silence of a silent mode shows nothing. But if the car was
-shown to stand before the mode was opened, the end of the silence shows that it left the mode.
+*Modes.* If a car reports in a mode, the form of its next report shows that it left the mode. On a car that has
+shown a stop before, one report is enough, if it comes at the right time. It must not come too early: the car must have
+begun this report after it obeyed `MODE00`. And it must not come too late: if `MODE00` lost its digits on the way, the
+car opens mode 0 with the motors on, and that blocks it for longer. The silence of a silent mode shows nothing. But if
+the car was shown to stand before the mode was opened, the end of the silence shows that it left the mode.
 
 *Damaged reports.* Reports have no checksum. A damaged frame of another mode can look like one of mode 0, so a report
 counts only after a silence that no other mode has. The start of one frame and the end of another can be joined. So the
@@ -68,8 +68,8 @@ from schemas.words import Blocking, Mode, Shows
 MIN_SILENCE_SHARE: Final = 0.6
 MIN_SILENCE_S: Final = 0.8
 """A report of mode 0 counts only after a silence of this share of the interval, or of this time if that is shorter. In
-other modes the car sends 20 frames a second, so a damaged frame that looks like mode 0 has no such silence before
-it."""
+other modes the car sends a frame every 0.12 s or sooner, so a damaged frame that looks like mode 0 has no such silence
+before it."""
 FASTEST_S: Final = 0.3
 """Interval of the fastest car. It is used until the interval of this car is known."""
 BUNCHED_SHARE: Final = 0.3
@@ -113,7 +113,8 @@ class Finding(StrEnum):
     REPORT = "report"
     """A report of mode 0 whose sonar heard an echo. No `MODE00` is waiting for it, so one could be judged now."""
     UNJUDGED = "unjudged"
-    """A report like `REPORT`, but the rhythm of the car is not known, so a `MODE00` could not be judged now."""
+    """A report like `REPORT`, but the rhythm of the car is not known well enough, so a `MODE00` could not be judged
+    now."""
     BLOCK_GAP = "block_gap"
     """A block gap. More are needed."""
     CONTROL = "control"
@@ -134,7 +135,7 @@ _NEVER: Final = float("-inf")
 class _Block(Struct, frozen=True):
     """A frame that blocks the car: its kind, its maximum block, and when it was written.
 
-    `kind` is None for a `MODE00` that will not be judged. Its block is not learned.
+    `kind` is None if the block is not learned: `MODE00` that will not be judged, or a frame without a `blocking_kind`.
     """
 
     kind: Blocking | None
@@ -158,9 +159,9 @@ class StopEvidence(Struct):
     changed_expectation: bool = False
     """True if the last reading showed that this car cannot show a stop after all, or has another rhythm than before."""
     _last_at: float = _NEVER
-    """When the last bytes arrived, except text and frames of the options (arm, gyro)."""
+    """When the last bytes arrived, except text, echoes, and frames of the options (arm, gyro)."""
     _foreign_at: float = _NEVER
-    """When the last frame arrived that is not a report of mode 0, whether whole or corrupted."""
+    """When the last reading of another mode or the last damaged frame arrived."""
     _echo_report_at: float | None = None
     """When the last report with an echo arrived. None if anything else has arrived since."""
     _no_echo_report_at: float | None = None
@@ -170,7 +171,7 @@ class StopEvidence(Struct):
     _first_delay_s: float | None = None
     """The delay of the first report after the `MODE00` that waits for a result. None if it is not known."""
     _delayed: int = 0
-    """Number of this stop's `MODE00` frames after which the first report was late, but not by the block."""
+    """Number of this stop's `MODE00` frames whose first report had another delay than the block, or none."""
     _block_gaps: int = 0
     _gaps_needed: int = BLOCK_GAPS
     _unjudged: bool = False
@@ -241,7 +242,7 @@ class StopEvidence(Struct):
     # ------------------------------------------------------------------ frames
 
     def begin_link(self) -> None:
-        """Forget everything except what was learned, because the link is new."""
+        """Drop the evidence of the last link. Keep what was learned, and the number of reports without an echo."""
         self.reacted_at = None
         self._last_at = self._foreign_at = _NEVER
         self._older_reports_s = 0.0
@@ -536,9 +537,10 @@ class StopEvidence(Struct):
             self._silent_mode = None
 
     def _judge_leaving(self, at: float, silence_s: float, within_s: float) -> Finding:
-        """Return SHOWN if this report shows that `MODE00` alone closed the mode. Return BLOCK_GAP if it comes too late.
+        """Return SHOWN if this report shows that `MODE00` alone closed the mode.
 
-        `within_s` is the maximum time from `MODE00` to a report that shows it.
+        Return BLOCK_GAP if it comes a little too late, or if the car has not shown a stop before. `within_s` is the
+        maximum time from `MODE00` to a report that shows it.
         """
         closed_at = self._closed_at
         other_mode_at, silent = self._other_mode_at, self._silent_mode
@@ -562,7 +564,7 @@ class StopEvidence(Struct):
         return Finding.SHOWN if is_judged else Finding.BLOCK_GAP
 
     def _count_late_leaving(self, at: float) -> Finding:
-        """Count a report that shows too late that the car left its mode. It is the first block gap, no more."""
+        """Count a report that is not enough to show that the car left its mode. It is the first block gap, no more."""
         self.reacted_at = at
         self._mode_00_at = None
         self._drop_gaps()

@@ -27,7 +27,7 @@ class Step(Struct, frozen=True):
 
 
 class StopSequence(Struct, frozen=True):
-    """A way to stop. Only a sequence of a higher `rank` replaces the running one."""
+    """A way to stop. A requested stop replaces the running one only if its `rank` is higher. A recovery always does."""
 
     name: str
     rank: int

@@ -18,10 +18,12 @@ from schemas.words import Mode, Platform
 
 WIRE_S: Final = 0.02  # docs/reference/protocol.md#stops: 20 ms of wire for a frame of 19 bytes at 960 B/s
 AVOIDING_TURN_S: Final = MODES[Mode.OBSTACLE_AVOIDANCE].turn_s
-"""Longest turn of obstacle avoidance. A car in an unknown state may be in this mode, whose turns are the longest."""
+"""Longest turn of obstacle avoidance with an echo; without one, it never ends. A car in an unknown state may be in this
+mode, whose turns are the longest."""
 RECOVERY_WORST_S: Final = 7.3  # docs/reference/protocol.md#stops: in theory the maximum, except in obstacle avoidance
 IN_TIME_S: Final = 0.2
-"""Minimum time between writing a frame and the end of a block, so that the frame arrives before the end on any link."""
+"""Minimum time between writing a frame and the end of a block, so that the frame arrives before the end, unless the
+link is slow."""
 
 
 def style_of(profile: Profile, *, doubted: bool, open_mode: bool) -> StopStyle:

@@ -27,12 +27,12 @@ MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case that is added to the timeout for the evidence, so that nobody waits longer than 17 s for an
 answer, or 23 s with the slowest car."""
 # The silence between two tries is longer than any block outside obstacle avoidance, so the car reads the next frame
-# alone. The silence becomes 6.5 s at most, so the car reads at least one of two tries within 15 s after the end of a
-# fault.
+# alone. Except on a slow car, it becomes 6.5 s at most, so the car reads at least one of two tries within 15 s after
+# the end of a fault.
 RETRY_S: Final = (RECOVERY_SILENCE_S, 4.5, 5.5, 6.5)
-"""Intervals from `MODE00` to the next try, by the number of tries."""
+"""Minimum intervals from `MODE00` to the next try, by the number of tries."""
 SLOWEST_S: Final = 3.0
-"""Interval of the slowest car. It is used until the interval of this car is known."""
+"""Interval of the slowest car. It is used if a report has arrived, but the rhythm of this car is not known."""
 REPORT_MARGIN_S: Final = 0.1
 """Margin of the wait for a report after the last frame of a try."""
 HELD_UP_S: Final = REPEAT_INTERVAL_S
@@ -58,7 +58,8 @@ def report_wait_s(profile: Profile, learned: Learned, *, slowest: bool = False) 
 class StopInProgress(Struct):
     """A stop in progress: the frames of its current try, and the commands that end with it. Times: s, monotonic.
 
-    A stop ends on evidence (see evidence.py). After its last frame it waits for a report, then tries again.
+    A stop ends on evidence (see evidence.py), or as its case allows. After its last frame it waits for a report, then
+    tries again.
     """
 
     sequence: StopSequence
@@ -91,10 +92,10 @@ class StopInProgress(Struct):
     """Arrival of the last report without an echo that the car sent after the newest `MODE00`. A single one may be
     corrupted, so two are needed."""
     without_echo: int = 0
-    """Number of reports without an echo since the stop began."""
+    """Number of reports without an echo in this stop, except those that came in the block of a `MODE00`."""
     probes: int = 0
     sent_all: bool = False
-    """True if all frames of the first try are written, or a report has arrived after its `MODE00`."""
+    """True if all frames of a try are written, or a report has arrived after the block of its `MODE00`."""
     overdue: bool = False
     """True if the car did not show the stop in time. The gateway continues to send it."""
     mode_command: Pending | None = None
