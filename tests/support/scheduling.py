@@ -73,8 +73,13 @@ _SLOW: Final = (
     "tests/gateway/tools/test_scan.py",
 )
 """Files with tests of 10 to 40 s. They would come last, and one worker would run them after the others are done."""
-_STARTING: Final = ("tests/fleet/replay/analysis/test_replan.py", "tests/fleet/replay/rerun/test_live.py")
-"""Files in these places that start processes. At low priority, a Rerun viewer took longer than 40 s to go on."""
+_STARTING: Final = (
+    "tests/fleet/replay/analysis/test_replan.py",
+    "tests/fleet/replay/rerun/test_live.py",
+    "tests/schemas/test_bus.py",
+)
+"""Files in these places that start processes, or time Zenoh's threads. At low priority, a Rerun viewer took longer than
+40 s to go on, and a session did not see the tokens of a new link in time."""
 
 
 class WorkerKind(Enum):
