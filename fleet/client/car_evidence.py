@@ -78,10 +78,10 @@ def newest_states(readings: Iterable[Reading]) -> dict[str, float]:
 
 
 def clocks_off(client: Fleet, newest_s: Mapping[str, float]) -> dict[str, float]:
-    """Return by how many seconds the clock of each car's gateway is wrong. Leave out cars whose clock is right.
+    """Return by how many seconds the clock of each car's gateway is wrong.
 
-    newest_s: by car, the newest stamp in its answers. If a stamp is off by more than MAX_CLOCK_OFF_S, listen to the
-    states of that car for at most _CLOCK_LISTEN_S.
+    Leave out cars whose clock is right or not known. newest_s: by car, the newest stamp in its answers. If a stamp is
+    off by more than MAX_CLOCK_OFF_S, listen to the states of that car for at most _CLOCK_LISTEN_S.
     """
     now_s = time.time()
     odd = {car for car, at_s in newest_s.items() if abs(at_s - now_s) > MAX_CLOCK_OFF_S}

@@ -106,13 +106,13 @@ def certified_sender(identity: str, sender: str | None = None, person: str | Non
 class Fleet:
     """A connection to one fleet: `with Fleet() as fleet`. Several threads may call its methods.
 
-    `endpoint` is the address of the bus, `tcp/HOST:PORT`. The default is FLEET_ENDPOINT, else port 7447 on this
-    computer. `name` is the fleet's name. `person` is the person in whose name commands are sent, such as `group_a`
-    (default: FLEET_AS, else the user's login). `sender` is the full name of the sender, `person@host-pid` by default.
-    `kind` is the rank of the sender: `script`, `person` (outranks scripts) or `coordinator`. `start_hub`: start a hub
-    on this computer if none runs. `identity` is the owner of the certificate to use, such as `service.coordinator`
-    (default: the user). If a person owns the certificate, commands are sent in this person's name, and another `person`
-    or `sender` raises keys.BadKey.
+    `endpoint` is the address of the bus, `tcp/HOST:PORT`. The default is FLEET_ENDPOINT, else the hub that this
+    computer has joined, else port 7447 on this computer. `name` is the fleet's name. `person` is the person in whose
+    name commands are sent, such as `group_a` (default: FLEET_AS, else the user's login). `sender` is the full name of
+    the sender, `person@host-pid` by default. `kind` is the rank of the sender: `script`, `person` (outranks scripts) or
+    `coordinator`. `start_hub`: start a hub on this computer if none runs. `identity` is the owner of the certificate to
+    use, such as `service.coordinator` (default: the user). If a person owns the certificate, commands are sent in this
+    person's name, and another `person` or `sender` raises keys.BadKey.
 
     While a Fleet is open, it has the liveliness token `<fleet>/@operator/<sender>` on the bus. If the token disappears,
     for example because the program has crashed, gateways end the drives of this client, and stop these cars. Modes that
@@ -266,11 +266,11 @@ class Fleet:
         return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until the condition `when` is true for a reading, and return it. The current reading counts, too.
+        """Wait until the condition `when` is true for a reading, and return it.
 
-        With `for_s`, the condition must have been true in all readings of this time, by their stamps. Without
-        `timeout_s`, wait for ever. Raises wait.NotInTime (a TimeoutError), conditions.BadExpression, and BusError if
-        this Fleet is closed meanwhile.
+        The current reading counts, too, unless it is stale. With `for_s`, the condition must have been true in all
+        readings of this time, by their stamps. Without `timeout_s`, wait for ever. Raises wait.NotInTime (a
+        TimeoutError), conditions.BadExpression, and BusError if this Fleet is closed meanwhile.
         """
         key_expression = self.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)

@@ -19,8 +19,8 @@ ANSWER_TIMEOUT_S: Final = 2.0
 WAIT_SAID_S: Final = 1.0
 """Time after which the user is told that a command waits for a busy car."""
 SEND_AGAIN_INTERVAL_S: Final = 0.5
-"""Interval at which a stop without an answer is sent again. A Zenoh session that has lost its hub tries to connect
-again at least as often."""
+"""Delay before a stop is sent again whose last query has ended without an answer. A Zenoh session that has lost its hub
+tries to connect again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
 """Interval at which a stop without an answer checks whether the bus is there, or was lost meanwhile."""
 _MAX_QUEUED_ITEMS: Final = 4096
@@ -101,7 +101,7 @@ class PendingCommand:
         self._bus_back_at: float | None = None
         """The time at which the bus came back. None if it is still lost, or was not lost."""
         self._unanswered_at: dict[str, float] = {}
-        """The time at which the last query of a stop ended without an answer, by car."""
+        """The time at which the last query ended, by car. It is used only for stops without an answer."""
         self.inbox: queue.Queue[Item] = queue.Queue(_MAX_QUEUED_ITEMS)
         self._asked_at = time.monotonic()
         self._is_closed = False

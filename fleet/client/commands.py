@@ -21,7 +21,7 @@ from schemas.words import Motion, Scope
 R = TypeVar("R")
 
 MAX_DRIVE_S: Final = 3600.0
-"""Maximum duration of a drive. A gateway allows 10 s unless it was started with a longer `--longest-drive`."""
+"""Maximum duration of a drive. A gateway allows 10 s unless it was started with another `--longest-drive`."""
 
 STOP_TTL_S: Final = 10.0
 """Maximum age of a stop when it arrives. A drive is rejected if it is delayed by 0.5 s, but a delayed stop is still
@@ -137,7 +137,10 @@ def lease_request(*, take: bool = False, release: bool = False) -> CommandReques
 
 
 def stop_request() -> CommandRequest:
-    """Request a stop and a hold: no plan moves the car until somebody drives or resumes it."""
+    """Request a stop and a hold.
+
+    No plan moves the car until a person or script drives it, gives it a mode, or resumes it.
+    """
     return CommandRequest(Verb.STOP, pb.StopCommand(), Until.STOPPED)
 
 
@@ -178,7 +181,7 @@ class CarCommands(ABC, Generic[R]):
     """The commands of one car. R is `Outcome` or an awaitable of it.
 
     Each command waits for its outcome (a stop waits until it is complete). `Outcome.ok` is True if the command was
-    carried out. Commands raise ValueError for a value out of range, but never because of a car.
+    carried out. Commands raise ValueError for a value out of range, but never because of a car, except within a lease.
     """
 
     def __init__(self, name: str) -> None:
@@ -191,7 +194,7 @@ class CarCommands(ABC, Generic[R]):
     def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = True) -> R:
         """Drive `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` ends the motion.
 
-        The duration is more than 0 s and at most 10 s, unless the gateway was started with a longer `--longest-drive`.
+        The duration is more than 0 s and at most 10 s, unless the gateway was started with another `--longest-drive`.
         At the end of the drive, the gateway stops the car, and the call returns. With `wait=False`, the call returns
         when the motion was sent. A further drive replaces the running one without a stop in between.
         """
@@ -238,7 +241,10 @@ class CarCommands(ABC, Generic[R]):
         return self.do(stop_request())
 
     def estop(self, why: str = "") -> R:
-        """Emergency-stop the car: it refuses everything until `resume`."""
+        """Emergency-stop the car: it accepts only stops until the e-stop ends.
+
+        To end it, call `resume` with its id, or with `everything`.
+        """
         return self.do(estop_request(why, Scope.CAR))
 
     def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:

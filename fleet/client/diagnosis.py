@@ -71,7 +71,8 @@ class CarEvidence(Struct, frozen=True):
     coordinated: bool = False
     """True if a coordinator is on the bus."""
     clock_off_s: float | None = None
-    """How far the clock of the gateway's computer is ahead of ours. Negative if it is behind, None if not known."""
+    """How far the clock of the gateway's computer is ahead of ours. Negative if it is behind. None if it is about
+    right, or not known."""
     runs_here: bool = False
     """True if a gateway of the car runs on this computer, even if it is not on the bus."""
     asked: bool = False

@@ -15,7 +15,7 @@ from typing import Final
 MAX_CLOCK_OFF_S: Final = 5.0
 """A larger difference of two clocks is reported. A gateway refuses a command that comes from further in the future."""
 _KEPT: Final = 8
-"""Number of messages that are remembered: those of two seconds, because four states come once a second each."""
+"""Number of messages that are remembered: those of 1.6 s, because five states come once a second each."""
 _MIN_STAMPS: Final = 2
 _NS: Final = 1e9
 

@@ -50,7 +50,8 @@ class Outcome:
     ok: bool
     """True if the command was carried out: it was sent to the car, and if it takes time, it is complete."""
     phase: str
-    """The last phase (`sent, complete, superseded, expired, failed, rejected, queued`), or `no_answer`."""
+    """The last phase (`asked, queued, sent, effect_seen, complete, superseded, expired, failed, rejected`), or
+    `no_answer`."""
     reason: str = ""
     """The gateway's reason if it was not carried out (`held, wrong_mode, link_down, ...`), else empty."""
     words: str = ""

@@ -36,7 +36,7 @@ def age_of_answer_s(stamp_s: float, now: float) -> float:
 
 
 _HEADER: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
-"""Fields that every message has."""
+"""Header fields, which are not shown. Logs have only `timestamp`, other messages all the others."""
 _NOT_MEASURED: Final = "<span title='not measured'>\u2014</span>"
 
 

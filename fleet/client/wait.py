@@ -46,7 +46,7 @@ class ConditionWait:
         self._undecided: Reading | None = None
 
     def ends(self, reading: Reading, now: datetime, arrived_s: float | None = None) -> bool:
-        """Return True if this reading ends the wait. Stale readings and readings out of order do not.
+        """Return True if this reading ends the wait. Stale answers to a query and readings out of order do not.
 
         arrived_s: when it arrived after its publication, s, monotonic; None if a query returned it. The time for which
         the condition must hold begins again after a step of the wall clock or a sleep of the computer.

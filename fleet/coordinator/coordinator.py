@@ -49,9 +49,9 @@ _UNSAVED: Final = "It cannot be saved: a restarted coordinator will not know it.
 class Coordinator:
     """Commands cars by a plan. `client` has the kind coordinator, and a sender that begins with SENDER.
 
-    The coordinator calls `on_decision` for each changed decision, and `on_failure` for each failed command and each
-    warning about a plan from the bus. `listed` has the cars in the fleet file, and is empty without a file. The caller
-    must have checked `plan` with lint.find_faults().
+    The coordinator calls `on_decision` for each changed decision, and `on_failure` for each new failure (of a command,
+    of the hub, or inside the coordinator) and each warning about a plan from the bus. `listed` has the cars in the
+    fleet file, and is empty without a file. The caller must have checked `plan` with lint.find_faults().
     """
 
     client: Fleet
@@ -178,7 +178,7 @@ class Coordinator:
         check_sender(observer.people if self.people is None else self.people, by)
 
     def _on_request(self, query: zenoh.Query, request: PlanRequest, observer: FleetObserver) -> None:
-        """Carry out a request for the plan in force. Its result is persisted and published before it is confirmed."""
+        """Carry out a request for the plan in force. Persist the state and publish an event before the reply."""
         try:
             by = sender_of(query, "fleet.v1.PlanCommand")
             self._check_sender(observer, by)

@@ -115,7 +115,7 @@ class Inbox:
                     self._enqueue(QueriedSample(answer))
 
     def _enqueue(self, item: Item) -> bool:
-        """Put an item into the inbox. Return False if the inbox is full. Runs on a Zenoh thread."""
+        """Put an item into the inbox. Return False if the inbox is full. May run on any thread."""
         try:
             self._items.put_nowait(item)
         except queue.Full:

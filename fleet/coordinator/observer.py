@@ -57,7 +57,7 @@ class FleetObserver(Struct):
         return People.merged(state.authority.people for state in self.states.values())
 
     def snapshot(self, busy: Iterable[str]) -> FleetSnapshot:
-        """Return a snapshot. `busy` are the cars with a pending command."""
+        """Return a snapshot. `busy` are the cars with a pending mode command."""
         # An unlisted name counts as a car once it has published its states. Before that, only a limited number of
         # such names count, and only while they are present.
         cars = {car: known for car, known in self.cars.items() if known.listed or car in self._confirmed}

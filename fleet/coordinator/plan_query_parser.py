@@ -37,7 +37,10 @@ def _payload(query: zenoh.Query) -> tuple[bytes, str]:
 
 
 def plan_command(query: zenoh.Query) -> tuple[str, str]:
-    """Return the text of the plan in a query (protobuf, JSON or plain text) and its sender. Raises BadPayload."""
+    """Return the text of the plan in a query (protobuf, JSON or plain text) and its sender.
+
+    Raises BadPayload, UnicodeDecodeError, or RequestRefused if the sender is not the certificate's owner.
+    """
     payload, encoding = _payload(query)
     if not encoding.startswith((topics.PROTOBUF, messages.JSON)):
         return payload.decode(), _proven(query, "")
@@ -46,7 +49,7 @@ def plan_command(query: zenoh.Query) -> tuple[str, str]:
 
 
 def sender_of(query: zenoh.Query, message_type: str) -> str:
-    """Return the sender of a command with or without a payload. Raises BadPayload."""
+    """Return the sender of a command with or without a payload. Raises BadPayload or RequestRefused."""
     payload, encoding = _payload(query)
     command: Any = messages.parse(message_type, payload, encoding) if payload else None
     return _proven(query, str(command.sender if command is not None else ""))

@@ -1,7 +1,7 @@
 """Persists roles, phase and rules in force for the next coordinator, in one small JSON file per fleet.
 
 The coordinator can do without the file, because it prefers cars that are already in the mode of a role
-(policy/role_allocation.py). So errors of reading and writing are ignored.
+(policy/role_allocation.py). So no error of reading or writing ends it.
 """
 
 import contextlib

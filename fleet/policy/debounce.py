@@ -17,7 +17,7 @@ class Debounced(Struct, frozen=True):
 
     on: bool
     since: float
-    """The time since which the condition has been true without a break."""
+    """Time at which the condition became true. While `on`, short breaks do not count."""
     otherwise_since: float | None = None
     """Time since which the value has been false or unknown, while `on` still holds. None if the value is true."""
 
@@ -25,8 +25,8 @@ class Debounced(Struct, frozen=True):
 def debounce(before: Debounced | None, value: bool | None, for_s: float, now: float) -> Debounced | None:  # noqa: FBT001 - the value itself
     """Return the new state of a condition.
 
-    It is on after it has been true for `for_s`. Then it ends (None) after it has been false for HYSTERESIS_S, or
-    unknown for UNKNOWN_TIMEOUT_S.
+    It is on after it has been true for `for_s`. Then it ends (None) if it is false, and has not been true for
+    HYSTERESIS_S, or if it is unknown, and has not been true for UNKNOWN_TIMEOUT_S.
     """
     if before is None or not before.on:
         if not value:

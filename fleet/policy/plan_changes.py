@@ -32,7 +32,7 @@ class PlanChange(Struct, frozen=True):
 def plan_changes(before: Plan, after: Plan) -> tuple[PlanChange, ...]:
     """Return the parts that differ: roles, fixed cars, rules, phases, and what a car without a role does.
 
-    The order of rules and phases is not compared.
+    The order of phases and of rules with names is not compared.
     """
     then, now = _parts(before), _parts(after)
     return tuple(

@@ -41,7 +41,7 @@ class RequestRefused(Exception):
 
 
 def check_sender(people: People, by: str) -> None:
-    """Raise RequestRefused if the sender `by` may not set, restart or stop the plan.
+    """Raise RequestRefused if the sender `by` may not set, restart or stop the plan, or end its phase.
 
     The supervisor may do so, because it sets the plan of the fleet file.
     """

@@ -30,7 +30,7 @@ _STAND_IN: Final = "/"
 _ROLE_LOSS_COST: Final = 1_000_000_000
 _MODE_CHANGE_COST: Final = 1_000_000
 _LINK_DOUBT_COST: Final = 10_000
-"""Each of these costs is higher than all lower ones together."""
+"""For one car, each of these costs is higher than all lower ones together."""
 
 
 class Barrier(Struct, frozen=True):
@@ -72,7 +72,7 @@ class Candidates(Struct, frozen=True):
     roles_before: Mapping[str, str]
     """The role of each car before this step."""
     unresponsive: frozenset[str]
-    """Cars that were commanded into their mode more than once and are not in it."""
+    """Cars that were commanded into their mode more than once, and have not stayed in it for long yet."""
     pinned: Mapping[str, PinnedRole]
     """The roles that rules pin, by car."""
     in_force: frozenset[str]

@@ -101,7 +101,7 @@ def is_in(name: str, message: Any) -> bool:
 
 
 class Refusal(Struct, frozen=True):
-    """A mode that a car's gateway refused, and why."""
+    """A mode command that was not carried out, and why: the gateway refused it, or did not answer."""
 
     mode: str
     reason: str
@@ -140,7 +140,7 @@ class CarSnapshot(Struct, frozen=True):
     """True if the fleet file lists the car."""
     refused: Refusal | None = None
     busy: bool = False
-    """True if a command to the car has no outcome yet."""
+    """True if a mode command to the car has no outcome yet."""
 
     @property
     def taken_by(self) -> str | None:
@@ -213,7 +213,7 @@ class FleetSnapshot(Struct, frozen=True):
 
 
 def format_reading(value: object) -> str:
-    """Format a value as expressions write it, floats with 4 digits."""
+    """Format a value for a person: floats with 4 digits, words without quotes."""
     if isinstance(value, bool):
         return "true" if value else "false"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

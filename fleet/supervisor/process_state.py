@@ -124,7 +124,7 @@ class ProcessState(Struct):
         return first
 
     def on_exit(self, code: int, why: str, now: float, chance: float) -> None:
-        """Note the exit code (negative: the signal). `why`: the last line on stderr. For `chance`, see `delay_s`."""
+        """Note the exit code (negative: the signal). `why`: the last error line. For `chance`, see `delay_s`."""
         if self.state is RunState.ENDING:
             self._set(RunState.WAITING if self._again else RunState.ENDED, now)
             self.due = now

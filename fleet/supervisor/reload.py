@@ -31,7 +31,7 @@ class SpecChange(Struct, frozen=True):
     restarted: tuple[str, ...]
     """Cars whose gateway is started or restarted."""
     words: tuple[str, ...]
-    """One line for each car that changes. Changes of groups, colors and people have none."""
+    """One line for each car that changes. Changes of groups and colors have none."""
     needs_restart: tuple[str, ...] = ()
     """Properties and cars that cannot change while the fleet runs, in words."""
 

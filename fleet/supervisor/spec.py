@@ -27,7 +27,7 @@ SIMULATED: Final = "sim"
 """The link of a car that the supervisor's simulator simulates."""
 SIMULATED_CAR_NAMES: Final = ("red", "green", "blue", "yellow", "orange", "violet", "white", "black")
 PLATFORMS: Final = (Platform.ARDUINO, Platform.STM32, Platform.ARDUINO, Platform.RASPBERRY_PI)
-"""Platforms that simulated cars get in turn if there is no fleet file."""
+"""Platforms that simulated cars get in turn if they are not in a fleet file."""
 MAX_SIMULATED_CARS: Final = 200
 RECORDINGS: Final = Path("sessions")
 

@@ -55,7 +55,7 @@ class Table:
         self._safely(self._live.stop)
 
     def on_event(self, event: "SupervisorEvent") -> None:
-        """Print an event above the table, unless the car's row shows it."""
+        """Print an event above the table if it is about a process, an old stop, or the start or end of the fleet."""
         if event.what in ("process", "hold", "end", "ready", "missing"):
             name = "" if event.what in ("ready", "missing") else f"{event.name}: "
             line = Text(f"{clock(time.time())} {name}{event.words}")

@@ -51,7 +51,8 @@ from schemas.yaml_document.document import BadFile
 STATUS_INTERVAL_S: Final = 1.0
 HUB_START_TIMEOUT_S: Final = 10.0
 SUPERVISOR_HUB_RESTART_DELAY_S: Final = 0.3
-"""Time without a link after which the supervisor restarts the hub. Other programs would start one after 0.5 s."""
+"""Time without a link after which the supervisor starts a hub in place of another program's. Other programs would start
+one after 0.5 s."""
 RECORDER_START_TIMEOUT_S: Final = 5.0
 """Timeout for the recorder's first heartbeat. Gateways start only after this heartbeat or timeout, so that the recorder
 misses nothing."""
@@ -83,9 +84,10 @@ class SupervisorEvent(Struct, frozen=True):
 
 
 class Supervisor:
-    """Keeps the processes of a fleet running. `run` returns True if no car may be moving and everything was recorded.
+    """Keeps the processes of a fleet running.
 
-    `read` reads the spec again for a reload, and raises ValueError if it is invalid. `on_event` gets each event.
+    `run` returns True if no car may be moving, and the recording, if there is one, was in order at the end. `read`
+    reads the spec again for a reload, and raises ValueError if it is invalid. `on_event` gets each event.
     """
 
     def __init__(

@@ -129,7 +129,7 @@ class SupervisorService:
         self._publisher.put(status, time.time_ns())
 
     def coordinator_answers(self) -> bool:
-        """Return True if the coordinator answers. Call it on a thread: it blocks for SERVICE_QUERY_TIMEOUT_S."""
+        """Return True if the coordinator answers. Call it on a thread: it blocks for up to SERVICE_QUERY_TIMEOUT_S."""
         return self.plan_in_force() is not None
 
     def plan_in_force(self) -> Any:

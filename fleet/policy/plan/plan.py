@@ -19,7 +19,7 @@ THIS_CAR: Final = "this_car"
 OTHER_CARS: Final = "other_cars"
 ALL_CARS: Final = "all_cars"
 RESERVED: Final = frozenset({THIS_CAR, OTHER_CARS, ALL_CARS, "all"})
-"""Words with a meaning in rules. They are not allowed as names of cars, roles or phases."""
+"""Words with a meaning in rules. The parser refuses them as names of roles, phases and the cars in `fixed`."""
 
 
 class Quantifier(StrEnum):
@@ -153,7 +153,7 @@ class Plan:
 
     @property
     def named_cars(self) -> tuple[str, ...]:
-        """The cars that the plan names in roles and effects."""
+        """The cars that the plan names in `fixed`, in roles and in effects, but not those only in conditions."""
         targets = (effect.who for rule in self.rules for effect in rule.effects)
         cars = [*self.fixed, *(car for role in self.roles.values() for car in role.cars or ())]
         return tuple(dict.fromkeys([*cars, *(who for who in targets if who and self.is_car(who))]))
