@@ -247,24 +247,25 @@ class CarGateway:
     def _on_revoked(self) -> None:
         """Stop the car, because nobody can command it any more, and it may be moving in a mode."""
         car, who = self._settings.car, self._bus.identity
-        words = (
-            f"the hub passes nothing on for {who}: its certificate was revoked, or {car} was invited elsewhere. Nobody "
-            f"can command {car} from here, so it is stopped. `fleet hub invite --car {car}` on the hub's computer and "
-            "`fleet join` here make another certificate; then start this gateway again."
-        )
+        why = f"the hub passes nothing on for {who}: its certificate was revoked, or {car} was invited elsewhere"
+        words = f"{self._needs_certificate(why)}; then start this gateway again."
         self._commands.log(Level.ERROR, "revoked", words)
         self._halt(words)
 
     def _on_certificate_end(self, ended: datetime) -> None:
         """Stop the car, because nobody can command it until there is a new certificate, and it may be moving."""
-        car, who = self._settings.car, self._bus.identity
-        words = (
-            f"the certificate of {who} ended on {ended:%Y-%m-%d}, so the hub refuses this gateway. Nobody can command "
-            f"{car} from here, so it is stopped. `fleet hub invite --car {car}` on the hub's computer and `fleet join` "
-            "here make another certificate."
-        )
+        why = f"the certificate of {self._bus.identity} ended on {ended:%Y-%m-%d}, so the hub refuses this gateway"
+        words = f"{self._needs_certificate(why)}."
         self._commands.log(Level.ERROR, "certificate_ended", words)
         self._halt(words)
+
+    def _needs_certificate(self, why: str) -> str:
+        """Return why the car is stopped, and how to make another certificate, without the last period."""
+        car = self._settings.car
+        return (
+            f"{why}. Nobody can command {car} from here, so it is stopped. `fleet hub invite --car {car}` on the hub's "
+            "computer and `fleet join` here make another certificate"
+        )
 
     def _halt(self, words: str) -> None:
         self._control.halt(words, self._loop.time())

@@ -41,16 +41,14 @@ class Pairing:
         address: where the console is on the network.
         """
         code = await asyncio.to_thread(issue_code, self._people, person)
-        qr = segno.make(pairing_link(address, code)).svg_data_uri(scale=5, border=4, light="#fff", dark="#000")
-        return {"code": code_words(code), "qr": qr, "address": address, "lifetime_s": CODE_LIFETIME_S}
+        return _shown(code, address, CODE_LIFETIME_S, scale=5)
 
     async def open_class(self, address: str) -> dict[str, Any]:
         """Open the console for a class. Return its code as JSON values. Raises ValueError or OSError."""
         code = new_code(secrets.choice)
         await asyncio.to_thread(self._people.change, lambda book: (book.open_class(code, time.time()), None))
-        qr = segno.make(pairing_link(address, code)).svg_data_uri(scale=10, border=4, light="#fff", dark="#000")
         log.warning("a class may join for %.0f minutes: its devices watch and stop", CLASS_LIFETIME_S / 60)
-        return {"code": code_words(code), "qr": qr, "address": address, "lifetime_s": CLASS_LIFETIME_S}
+        return _shown(code, address, CLASS_LIFETIME_S, scale=10)
 
     async def close_class(self) -> None:
         """Let no more devices of a class join. Raises OSError."""
@@ -92,6 +90,12 @@ class Pairing:
     def _redeemed(book: PeopleBook, code: str, cookie: str, device: str) -> tuple[PeopleBook, PeopleBook | None]:
         found = book.redeem(code, cookie, secrets.token_hex(3), device, time.time())
         return (book, None) if found is None else (found, found)
+
+
+def _shown(code: str, address: str, lifetime_s: float, *, scale: int) -> dict[str, Any]:
+    """Return what a page shows of a code, as JSON values. `scale` is the size of the picture."""
+    qr = segno.make(pairing_link(address, code)).svg_data_uri(scale=scale, border=4, light="#fff", dark="#000")
+    return {"code": code_words(code), "qr": qr, "address": address, "lifetime_s": lifetime_s}
 
 
 def issue_code(people: PeopleFile, person: PagePerson) -> str:

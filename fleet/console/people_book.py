@@ -139,6 +139,10 @@ class PeopleBook(Struct, frozen=True):
     def issue(self, code: str, person: PagePerson, now: float) -> Self:
         """Add a code for a person. Raises UnknownPerson, and ValueError if the name or the rank is invalid."""
         self._check(person)
+        return self._with_code(code, person, now)
+
+    def _with_code(self, code: str, person: PagePerson, now: float) -> Self:
+        """Add a code. Forget those that are not open any more, and the oldest beyond the maximum."""
         open_codes = [each for each in self.codes if each.is_open(now)]
         codes = (*open_codes, PairingCode(digest(normal_code(code)), person, now))
         return replace(self, codes=codes[-MAX_CODES:])
@@ -150,9 +154,7 @@ class PeopleBook(Struct, frozen=True):
         """
         if GUEST in (self.people or ()):
             raise ValueError(f"`people:` in the fleet file has a {GUEST}. Give that person another name first.")
-        book = self.close_class()
-        codes = (*(each for each in book.codes if each.is_open(now)), PairingCode(digest(normal_code(code)), _ANY, now))
-        return replace(book, codes=codes[-MAX_CODES:])
+        return self.close_class()._with_code(code, _ANY, now)
 
     def close_class(self) -> Self:
         """End the code of the class. Its guests stay."""

@@ -40,13 +40,13 @@ def pair_routes(lan: "Lan") -> list[Route]:
         except ClassFull as error:
             return _failure(str(error), 409)
         except WrongCode as error:
-            wait = str(math.ceil(error.wait_s))
-            words = f"This code is wrong, used or too old. Wait {wait} s before the next try."
+            words, wait_s = "This code is wrong, used or too old.", math.ceil(error.wait_s)
+            if wait_s == 0:
+                return _failure(words, 403)
+            words = f"{words} Wait {wait_s} s before the next try."
             if isinstance(error, TooManyGuesses):
-                words = f"Too many wrong codes came from this device's address. Try again in {wait} s."
-            elif error.wait_s == 0:
-                return _failure("This code is wrong, used or too old.", 403)
-            return _failure(words, 429, {"retry-after": wait})
+                words = f"Too many wrong codes came from this device's address. Try again in {wait_s} s."
+            return _failure(words, 429, {"retry-after": str(wait_s)})
         return JSONResponse({"ok": True, "name": person.name}, headers={"set-cookie": lan.set_cookie(cookie)})
 
     return [Route(PAIR_PATH, page), Route(PAIR_PATH, pair, methods=["POST"])]

@@ -41,8 +41,8 @@ SHUTDOWN_TIMEOUT_S: Final = 2.0
 # to 3 ms.
 COLLECT_AFTER: Final = 100
 """Number of handshakes after which their garbage is collected: 9 MB at most."""
-SOCKET_RETRY_S: Final = 0.02
-"""Interval at which sockets are tried on Windows, whose loop cannot watch them: the same as `SERVE_INTERVAL_S`."""
+SOCKET_RETRY_S: Final = SERVE_INTERVAL_S
+"""Interval at which sockets are tried on Windows, whose loop cannot watch them."""
 _READ_BYTES: Final = 4096
 _TLS_HELLO: Final = b"\x16"
 """The first byte of a TLS client: a handshake record (RFC 8446, 5.1)."""

@@ -1,4 +1,4 @@
-"""What rules do that are in force (`rules_in_force`): which role or mode they give to which car. Pure."""
+"""The effects of the rules in force (`rules_in_force`): the roles and modes that they give to cars. Pure."""
 
 from collections.abc import Collection, Iterator, Mapping
 

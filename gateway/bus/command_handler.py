@@ -145,16 +145,18 @@ class CommandHandler:
     def _save(self) -> None:
         """Save a changed safety state."""
         # Save before answering: a person who reads that the e-stop is in force may switch the computer off.
-        safety, now = self._control.safety.persisted, self._clock()
-        if safety == self._saved_safety or (safety == self._unsaved_safety and now < self._save_at):
+        safety = self._control.safety.persisted
+        if safety == self._saved_safety:
             return
-        was_told, self._unsaved_safety = safety == self._unsaved_safety, safety
+        now, is_retry = self._clock(), safety == self._unsaved_safety
+        if is_retry and now < self._save_at:
+            return
         try:
             self._save_to_disk(safety)
             self._saved_safety, self._unsaved_safety = safety, None
         except OSError as error:
-            self._save_at = now + SAVE_RETRY_S
-            if was_told:
+            self._unsaved_safety, self._save_at = safety, now + SAVE_RETRY_S
+            if is_retry:  # it was told at the first try
                 return
             words = f"{self._car} will lose its hold and e-stops if its gateway restarts: {error}"
             self.log(Level.ERROR, "not_saved", words)

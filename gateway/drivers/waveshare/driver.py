@@ -389,7 +389,7 @@ class WaveshareDriver(PlainDriver):
     def _check_stuck(self, event: Feedback, now: float) -> None:
         """End a drive in which a wheel stands still, because the speed control adds power until the wheel turns."""
         held, model = self.queue.held, self._model
-        turning = []
+        turning: list[bool] = []  # stays empty if no wheel has to turn
         if model.motors is Motors.ON and held is not None and held.began_at is not None:
             # In a slow curve, the inner wheel shall turn no faster than a wheel that counts as turning.
             speeds = zip((event.left_m_s, event.right_m_s), self._speeds(held.motion), strict=True)

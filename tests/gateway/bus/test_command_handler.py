@@ -1,4 +1,4 @@
-"""What the handler of commands does with a safety state that the disk does not take."""
+"""The handler of commands saves the safety state again if the disk was full."""
 
 from typing import Any
 
