@@ -146,7 +146,7 @@ class Pacing:
     def buffer_until(self) -> float:
         """Return until when the last frame may be unread, so that the next one could join it in the car's buffer."""
         # A longer block does not matter: after the car has read the frame, the next one is alone in the buffer.
-        return max(self._read_by, min(self.flight_until, self._written_at + REPEAT_INTERVAL_S))
+        return max(self._read_by, min(self.ready_at(Gate.FLIGHT), self._written_at + REPEAT_INTERVAL_S))
 
     @property
     def earliest_block_end(self) -> float:

@@ -162,6 +162,22 @@ def test_repeated_drive_of_same_motion_writes_no_frame(desk: Workbench) -> None:
     assert desk.end("hers") == (SENT, None)
 
 
+def test_stop_does_not_wait_for_a_possible_block() -> None:
+    """Nobody has measured whether moving the arm blocks a car, so only actions wait for that."""
+    desk = Workbench("arduino+head=3WD+arm").ready()
+    desk.ask(Drive(Motion.FORWARD))
+    desk.run(1.3)
+    desk.hear()
+    desk.ask(MoveArm((90,) * 6))
+    desk.until(lambda: b"ServoJ" in desk.frames[-1], 1.0)
+    desk.run(0.15)
+    desk.sent.clear()
+    asked_at = desk.now
+    desk.ask(Stop())
+    desk.run(0.1)
+    assert [(at - asked_at, frame) for at, frame, _ in desk.sent] == [(pytest.approx(0.0, abs=0.01), b"$3WD,MODE00#")]
+
+
 def test_newest_queued_drive_supersedes_earlier_ones(desk: Workbench) -> None:
     desk.ask(WHISTLE)  # blocks for 0.3 s, so the next commands wait
     for number, motion in enumerate([Motion.FORWARD, Motion.LEFT, Motion.RIGHT, Motion.BACK]):
