@@ -240,9 +240,7 @@ class CarMonitor:
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self._executor.senders.halt_streams(now)
         running = self._stops.running
-        if model.at_rest and running is None:
-            self._stops.stop_again(now)
-        elif running is None or running.case is cases.SOFT:
+        if running is None or running.case is cases.SOFT:
             self._stops.recover(now, words)
         model.learn(TrustEvent.SILENT, now, words)
 

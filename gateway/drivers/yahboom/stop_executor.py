@@ -56,7 +56,7 @@ class StopExecutor:
         model.believed.repeat = False
         joining = [pending] if pending is not None else []
         running = self.running
-        if running is None or running.sequence.rank < sequence.rank or running.at_rest:
+        if running is None or running.sequence.rank < sequence.rank:
             self._start(sequence, why, now, [*(running.commands if running is not None else ()), *joining])
             return
         running.commands.extend(joining)
@@ -69,12 +69,6 @@ class StopExecutor:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._log.record_sent(pending, now, f"joined the running {running.sequence.name} stop")
-
-    def stop_again(self, now: float) -> None:
-        """Send general stops to a car that had shown that it stands still, and is silent now."""
-        self._start(self.soft(now), FrameOrigin.RECOVERY, now, [])
-        assert self.running is not None
-        self.running.at_rest = True
 
     def leave_open_mode(self, now: float) -> None:
         """Send `MODE00` to a car whose readings show an open mode, if it has only got general stops until now."""
@@ -203,7 +197,7 @@ class StopExecutor:
 
     def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
         """Return the case with which the stop ends as sent. None if it does not end now."""
-        if running.at_rest or self.model.trust.state is CarTrust.UNHEARD:
+        if self.model.trust.state is CarTrust.UNHEARD:
             return None
         facts = self._facts(running, now)
         if not facts.frames_sent or not (facts.is_time_up or facts.reported):
@@ -240,8 +234,7 @@ class StopExecutor:
 
     def _try_again(self, running: StopInProgress, now: float) -> None:
         running.tries += 1
-        context = self.model.for_stop(now)
-        running.begin_try(stop_choice.soft(context) if running.at_rest else stop_choice.recovery(context), now)
+        running.begin_try(stop_choice.recovery(self.model.for_stop(now)), now)
         self.model.evidence.on_retry()
 
     def fail_late(self, running: StopInProgress, now: float) -> None:
@@ -352,7 +345,7 @@ class StopExecutor:
         The frames that were written during the silence may be lost, or may arrive all at once.
         """
         running = self.running
-        if running is None or running.at_rest:
+        if running is None:
             self.recover(now, words)
         else:
             self._try_again(running, now)
@@ -360,7 +353,7 @@ class StopExecutor:
     def on_sleep(self, now: float) -> None:
         """Stop the car after a sleep of the computer. Continue an earlier stop, with its next try at once."""
         running = self.running
-        if running is not None and running.sequence.rank > sequences.SOFT.rank and not running.at_rest:
+        if running is not None and running.sequence.rank > sequences.SOFT.rank:
             if running.frames_sent:
                 self._try_again(running, now)
         elif running is not None or not self.shutting_down:

@@ -102,9 +102,6 @@ class StopInProgress(Struct):
     """The mode command for which this stop is sent first."""
     repeats: bool = False
     """True if this stop repeats one whose first frames are written already. Then a command may replace it at once."""
-    at_rest: bool = False
-    """True if the car had shown that it stands still before it fell silent. Then it gets only general stops: unlike a
-    named frame, a general stop that loses bytes cannot start the motors."""
     case: StopCase = cases.MANUAL
     """The case of the stop: it decides when the stop may end if the car does not show it."""
 
