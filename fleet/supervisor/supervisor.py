@@ -125,7 +125,9 @@ class Supervisor:
         self._recorder_heard_at = inf
         """The time of the last status from any recorder of this fleet."""
         self._unrecorded = ""
-        """Why not everything is recorded, although it should be."""
+        """Why nothing is recorded now, although it should be."""
+        self._drops: dict[str, int] = {}
+        """How many messages the recorder has dropped in each session."""
         self._console = ""
         """Address of the web page."""
         self.starting = True
@@ -187,7 +189,7 @@ class Supervisor:
         finally:
             await self._leave()
             self._log.close()
-        return not (self._shutdown.not_stopped or self._unrecorded)
+        return not (self._shutdown.not_stopped or self._lost)
 
     @property
     def log_path(self) -> Path:
@@ -440,6 +442,7 @@ class Supervisor:
             if self.processes.on_heartbeat(RECORDER):
                 self._gateways_from = self.processes.now
             self._recorder_heard_at = self.processes.now
+            self._drops[value.session] = sum(value.drops.values())
             over = ""
             if value.state == RecorderState.CLOSED:
                 over = "closed, and some of what waited is lost" if value.drops else "what waited is written"
@@ -459,6 +462,13 @@ class Supervisor:
                 self._say("car", car, words)
             if topic == "event/log":
                 self._say("log", car, row.event)
+
+    @property
+    def _lost(self) -> str:
+        """Return why not everything was recorded. Empty if the recorder could keep everything that reached it."""
+        dropped = sum(self._drops.values())
+        words = f"the recorder dropped {dropped} messages (`fleet sessions verify` lists them)" if dropped else ""
+        return self._unrecorded or words
 
     def _set_unrecorded(self, why: str, over: str = "") -> None:
         """Report once that nothing is recorded any more, and once that everything is recorded again. Cars keep driving.
@@ -539,7 +549,7 @@ class Supervisor:
                 self.processes.end(process, grace)
                 await self._until_ended([process])
         await asyncio.wait([stop_query], timeout=SERVICE_EXIT_TIMEOUT_S)
-        lost = f"; not everything was recorded: {self._unrecorded}" if self._unrecorded else ""
+        lost = f"; not everything was recorded: {self._lost}" if self._lost else ""
         self._say("end", SELF, f"{describe_end(self._shutdown.results)}{lost}")
 
     async def _until_ended(self, processes: list[ManagedProcess]) -> None:
@@ -572,7 +582,7 @@ class Supervisor:
             session=self._session,
             groups={name: ",".join(cars) for name, cars in self._spec.groups.items()},
             colors=self._spec.colors,
-            unrecorded=self._unrecorded,
+            unrecorded=self._lost if self._state is RunState.ENDED else self._unrecorded,
         )
         for process in self.processes:
             life = process.status

@@ -596,8 +596,8 @@ def test_paused_recording_is_told_by_up_status_doctor_and_down(tmp_path: Path) -
         up.until("ready", "@supervisor", "red is ready")
         recorder = up.bus.publisher("fleet/@recorder/status", TOPICS["@recorder/status"], keys.RECORDER)
 
-        def publish(state: str, error: str = "") -> None:
-            recorder.put(pb.Recording(state=state, error=error), time.time_ns())
+        def publish(state: str, error: str = "", **drops: int) -> None:
+            recorder.put(pb.Recording(state=state, error=error, drops=drops), time.time_ns())
 
         publish("full", "0.1 MB are left")
         up.until("process", "@recorder", "0.1 MB are left")
@@ -612,10 +612,12 @@ def test_paused_recording_is_told_by_up_status_doctor_and_down(tmp_path: Path) -
         assert up.status().unrecorded == ""
         publish("failed", "it was unplugged")
         up.until("process", "@recorder", "it was unplugged")
+        publish("recording", red=2)
+        up.until("process", "@recorder", "records again")
         down = up.fleet("down")
-        assert down.returncode == 1
+        assert down.returncode == 1, "it records again, but not everything was recorded"
         assert "red: stopped" in down.stdout
-        assert "it was unplugged" in down.stderr
+        assert "dropped 2 messages" in down.stderr
         assert up.process.wait() == 1
 
 
