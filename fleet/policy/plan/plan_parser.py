@@ -8,6 +8,7 @@ from fleet.conditions import BadExpression, Expression
 from fleet.conditions import parse as parse_expression
 from fleet.conditions.functions import FUNCTIONS
 from fleet.policy.plan.plan import (
+    ALL_CARS,
     OTHER_CARS,
     RESERVED,
     THIS_CAR,
@@ -80,11 +81,7 @@ class _PlanParser:
         for place, names in (("roles", entry.roles), ("fixed", entry.fixed), ("phases", entry.phases)):
             for name in names:
                 self._mark({"fixed": "car"}.get(place, place[:-1]), name, (place, name), on_key=True)
-                self._check_name((place, name), name, on_key=True)
-                if name in RESERVED:
-                    self._report(
-                        (place, name), f"{name} is a word of rules ({', '.join(sorted(RESERVED))})", on_key=True
-                    )
+                self._check_own_name((place, name), name, on_key=True)
         for name in entry.roles:
             if name in entry.fixed:
                 self._report(("roles", name), "a car in `fixed` has this name: a rule could mean either", on_key=True)
@@ -191,7 +188,7 @@ class _PlanParser:
             self._report(where, "needs who and one of role, mode, led; or phase alone", unless=where)
         if entry.role is not None:
             self._check_role((*where, "role"), entry.role)
-        if entry.who is not None and entry.who not in self._entry.roles:
+        if entry.who is not None and entry.who not in (*self._entry.roles, THIS_CAR, OTHER_CARS, ALL_CARS):
             self._check_car((*where, "who"), entry.who)
         if entry.role is not None and entry.who in self._entry.roles:
             self._report((*where, "who"), "a role takes no other role: name a car, this_car, other_cars or all_cars")
@@ -266,13 +263,16 @@ class _PlanParser:
 
     def _check_car(self, where: Where, name: str) -> None:
         self._mark("car", name, where)
-        self._check_name(where, name)
+        self._check_own_name(where, name)
 
-    def _check_name(self, where: Where, name: str, *, on_key: bool = False) -> None:
+    def _check_own_name(self, where: Where, name: str, *, on_key: bool = False) -> None:
+        """Check a name that the user has chosen, of a car or of a part of the plan."""
         try:
             keys.check_name(name, "name")
         except keys.BadKey as error:
             self._report(where, str(error), on_key=on_key)
+        if name in RESERVED:
+            self._report(where, f"{name} is a word of rules ({', '.join(sorted(RESERVED))})", on_key=on_key)
 
     def _check_role(self, where: Where, name: str, others: Collection[str] = ()) -> None:
         if name not in self._entry.roles and name not in others and not self._is_faulty("roles", name):

@@ -99,6 +99,15 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
             "rule 1, when: true … quotes or fields, `name: value`.",
         ),
         ("roles: {other_cars: {mode: tracking}}", "other_cars … word of rules"),
+        ("roles: {a: {mode: tracking, cars: [all_cars]}}", "all_cars … word of rules"),
+        (
+            ROLE + "rules: [{when: light.left, then: {who: all, mode: manual}}]",
+            "all … word of rules",
+        ),
+        (
+            ROLE + "rules: [{when: {car: this_car, is: light.left}, then: {who: red, mode: manual}}]",
+            "this_car … word of rules",
+        ),
         ("fixed: {a: {role: b}}\n" + ROLE, "in `fixed` "),
         (
             ROLE + "rules: [{when: {any_car: light.left, all_cars: light.left}, then: {phase: x}}]",
