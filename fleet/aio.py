@@ -8,12 +8,14 @@ import time
 import weakref
 from collections.abc import Callable, Coroutine, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from types import TracebackType
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet.client import client
+from fleet.client.client import closed_error
 from fleet.client.commands import (
     CarCommands,
     CommandRequest,
@@ -121,7 +123,10 @@ class Fleet:
         return watch
 
     async def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
-        """Wait until the condition `when` is true for a fresh reading, and return it. Raises wait.NotInTime."""
+        """Wait until the condition `when` is true for a fresh reading, and return it.
+
+        Raises wait.NotInTime, conditions.BadExpression, and BusError if this Fleet is closed meanwhile.
+        """
         key_expression = self.sync.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)
         try:
@@ -133,8 +138,8 @@ class Fleet:
                     if waiting.ends(reading, datetime.now(UTC), time.monotonic()):
                         return reading
         except TimeoutError:
-            pass
-        raise waiting.timeout_error(key_expression, timeout_s or 0.0, datetime.now(UTC))
+            raise waiting.timeout_error(key_expression, timeout_s or 0.0, datetime.now(UTC)) from None
+        raise closed_error()
 
     async def publish_pose(
         self,
@@ -231,10 +236,15 @@ class Lease:
         entering = asyncio.ensure_future(self._fleet.call(self._lease.__enter__))
         try:
             return Car(self._fleet, self._name, await asyncio.shield(entering))
-        except asyncio.CancelledError:
-            await entering
-            await self.__aexit__(None, None, None)
+        except asyncio.CancelledError as cancelled:
+            await asyncio.shield(self._undo(entering, cancelled))
             raise
+
+    async def _undo(self, entering: asyncio.Future[client.LeasedCar], cancelled: BaseException) -> None:
+        """End the lease of a block whose task was cancelled on the way into it."""
+        with suppress(Exception):  # without a lease there is nothing to end, and the cancellation goes on
+            await entering
+            await self.__aexit__(type(cancelled), cancelled, None)
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -103,6 +103,11 @@ def certified_sender(identity: str, sender: str | None = None, person: str | Non
     return sender or default_sender(known[1])
 
 
+def closed_error() -> BusError:
+    """Return the error of a method that needs an open Fleet."""
+    return BusError("this Fleet is closed: use it inside its `with`, or open another one")
+
+
 class Fleet:
     """A connection to one fleet: `with Fleet() as fleet`. Several threads may call its methods.
 
@@ -188,7 +193,7 @@ class Fleet:
     def _check_open(self) -> None:
         """Raise BusError if the fleet is closed."""
         if self._closed:  # the errors that Zenoh and the pools would raise do not help
-            raise BusError("this Fleet is closed: use it inside its `with`, or open another one")
+            raise closed_error()
 
     # ------------------------------------------------------------------ reading
 

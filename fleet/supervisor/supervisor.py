@@ -484,6 +484,8 @@ class Supervisor:
         try:
             values = json.loads(line)
         except ValueError:
+            values = None
+        if not isinstance(values, dict):
             return True  # the line is text for a person
         if process.kind is ProcessKind.RECORDER:
             self._session = values["session"]

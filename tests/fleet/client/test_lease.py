@@ -14,6 +14,7 @@ from fleet.aio import Fleet as AsyncFleet
 from fleet.client.client import Car
 from fleet.client.lease import LeaseMonitor
 from fleet.client.outcome import Outcome
+from schemas.bus import BusError
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.rights import Sender
 from tests.fleet.conftest import Cars, asked
@@ -299,6 +300,30 @@ async def test_lease_of_cancelled_task_stops_car(cars: Cars) -> None:
         with pytest.raises(asyncio.CancelledError):
             await task
         assert not await asyncio.to_thread(driving, cars.sim, "blue")
+
+
+async def test_task_that_is_cancelled_while_lease_is_refused_stays_cancelled(cars: Cars) -> None:
+    with Fleet(cars.endpoint, sender="ann", kind="person") as ann, ann.car("blue").lease():
+        async with AsyncFleet(cars.endpoint, sender="eve") as fleet:
+
+            async def drive() -> None:
+                async with fleet.car("blue").lease():
+                    pass
+
+            task = asyncio.create_task(drive())
+            await asyncio.sleep(0)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+
+
+async def test_wait_of_closed_fleet_raises_bus_error(cars: Cars) -> None:
+    async with AsyncFleet(cars.endpoint, sender="eve") as fleet:
+        waiting = asyncio.create_task(fleet.wait("red/state/safety", "motors == 'on'", timeout_s=60.0))
+        await asyncio.sleep(0)
+        await fleet.get("red/state/safety")  # as `wait` does before it waits
+    with pytest.raises(BusError):
+        await waiting
 
 
 async def test_async_for_yields_readings_until_fleet_closes(cars: Cars) -> None:
