@@ -112,7 +112,7 @@ class CarModel:
     @property
     def silence_limit_s(self) -> float | None:
         """Return the longest normal silence now, or None if every silence is normal."""
-        return self.mode.silence_limit(fan=bool(self.believed.fan))
+        return self.mode.silence_limit(fan=self.believed.fan_may_run)
 
     @property
     def why_quiet(self) -> str:

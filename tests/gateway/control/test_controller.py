@@ -937,6 +937,18 @@ def test_level_fan_stays_on_through_lights_drives_reports() -> None:
     assert (pair.car.truth.fan, pair.control.driver.model.believed.fan) == (False, False)
 
 
+def test_silence_is_normal_if_fan_may_run(desk: Workbench) -> None:
+    """After the link was lost, nobody knows whether the fan runs, so a toggle may have switched it on."""
+    desk.control.driver.link_down("cut", desk.now)
+    desk.control.driver.link_up(desk.now)
+    desk.run(8.0, reports=False)
+    desk.ask(Fan())
+    desk.run(4.0, reports=False)
+    assert b"$0,0,0,0,0,0,0,1,0#" in desk.frames
+    model = desk.control.driver.model
+    assert (model.outputs.fan, model.silence_limit_s) == (None, None)
+
+
 def test_timer_reports_do_not_show_fan() -> None:
     pair = Pair("stm32", start_s=2.0).ready()
     pair.ask(Fan())
