@@ -15,12 +15,13 @@ STATUS: Final = f"{keys.RECORDER}/status"
 EVENTS: Final = "event/command"
 MAX_EXPORTED_CARS: Final = 256
 """Maximum number of cars with metrics. If there are more, only the first by name have metrics. Each car has about
-eighty series, and anybody on an open bus may invent cars. The fleet file of a whole hall has some dozens of cars."""
+forty series, and one more for each kind of command and refusal. Anybody on an open bus may invent cars. The fleet file
+of a whole hall has some dozens of cars."""
 MAX_RECENT_RECORDS: Final = 4096
 """Maximum number of remembered records of commands. They are remembered so that each phase counts once: if a car cannot
 show the effect of a command, the command ends with a second `sent`: a stop at most 23 s later
-(schemas.limits.MAX_EVIDENCE_TIMEOUT_S and its worst case), a drive at its end. The number is enough for 170 stops a
-second."""
+(schemas.limits.MAX_EVIDENCE_TIMEOUT_S and its worst case), a drive at its end. The number is enough for 170 records a
+second, and a stop has at least two."""
 _REFUSALS: Final = frozenset({Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 Sampled = tuple[Metric, tuple[str, ...], float]

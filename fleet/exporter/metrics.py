@@ -17,7 +17,7 @@ from schemas.words import UNKNOWN, LinkState, Mode, Motors, RecorderState
 Values = Iterable[tuple[tuple[str, ...], float]]
 """Pairs: the values of the labels after `car`, and the value of the metric."""
 OTHER: Final = "other"
-"""The label for any word that this version does not know."""
+"""The label for a verb or a reason that this version does not know. For other words it is `unknown`."""
 
 
 class MetricKind(StrEnum):

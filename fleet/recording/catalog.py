@@ -6,8 +6,8 @@ as commanded and as seen, the motion, who drove, and the phase of the plan. The 
 context are persons. `sender` and other columns are as recorded: `person_of(sender)` is the person. Topics without a
 message have views, too.
 
-A view is defined only when a question names it, because DuckDB then opens its files: a thousand sessions have twenty
-files each.
+A view is defined only when a question names it or asks which views there are, because DuckDB then opens its files: a
+thousand sessions have twenty files each.
 """
 
 import re
@@ -61,15 +61,16 @@ class BadQuery(ValueError):
 
 
 class QueryFailed(RuntimeError):
-    """A question that failed because of memory, disk or files. The text is DuckDB's, on one line."""
+    """A question that failed because of memory, disk or files. The text is on one line: DuckDB's, or what to do."""
 
 
 class Catalog:
     """The sessions of a directory, for SQL questions: `Catalog().query("SELECT min(range_m) FROM sensor_range")`.
 
-    Each topic is a view, such as `sensor_range`. `directory` is `./sessions` by default. `on_session` is called for
-    each session that is looked at. `damage` lists the parts that could not be read. Raises FormatMissing without
-    DuckDB, and QueryFailed without a directory for temporary files.
+    Each topic is a view, such as `sensor_range`. `directory` is `./sessions` by default, or, if there is none, the
+    directory in which the fleet file here records. `on_session` is called for each session that is looked at. `damage`
+    lists the parts that could not be read. Raises FormatMissing without the extra `analysis`, QueryFailed without a
+    directory for temporary files, and OSError if `directory` cannot be listed.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class Catalog:
         *,
         on_session: Callable[[Path], None] | None = None,
     ) -> None:
-        """`directory`: None for `sessions` here. `on_session` is called for each session that is looked at."""
+        """`directory`: None for `sessions_place()`. `on_session` is called for each session that is looked at."""
         try:
             import duckdb
         except ImportError:
@@ -191,7 +192,7 @@ class Catalog:
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
 
     def left_out(self) -> dict[str, LeftOut]:
-        """Return the messages of each session that no view has, because they cannot be decoded.
+        """Return the messages of each session that no view has: not decodable, or not of the type of their key.
 
         Only topics for which a question has asked so far are counted.
         """
@@ -226,8 +227,8 @@ class Catalog:
         empty = f"empty_{name}"
         self._database.register(empty, _empty(topic))
         ours = self._columns(f'"{empty}"')
-        # Files are grouped by their columns: first those of this version, then the others. If a column has another type
-        # in a file, its value is converted, or null if that fails. A column that only other versions have becomes text.
+        # Files are grouped by their columns. If a column has another type in a file, its value is converted, or null if
+        # that fails. A column that only other versions have becomes text.
         groups: dict[tuple[tuple[str, str], ...], list[str]] = {}
         for cached in self.sessions:
             for file in cached.files(topic.message):

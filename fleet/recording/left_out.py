@@ -13,7 +13,7 @@ from msgspec import Struct, field
 from schemas.printable import printable
 
 MAX_LEFT_OUT_LINES: Final = 20
-"""Maximum number of lines to print."""
+"""Maximum number of lines to print. One more line sums up the rest."""
 
 
 class LeftOutCause(StrEnum):
@@ -61,7 +61,7 @@ class LeftOut(Struct):
         for (key, cause), count in ordered[:MAX_LEFT_OUT_LINES]:
             yield f"{count} of {printable(key)}: {cause}"
         if rest := ordered[MAX_LEFT_OUT_LINES:]:
-            yield f"{sum(count for _, count in rest)} of {len(rest)} more keys"
+            yield f"{sum(count for _, count in rest)} more, of {len(rest)} other keys or causes"
 
 
 def has_unknown_enum(message: Any) -> bool:

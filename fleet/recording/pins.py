@@ -18,7 +18,8 @@ PIN_AFTER_NS: Final = 30_000_000_000
 """Pinned time before and after a stop or a mark, ns: together one minute."""
 MAX_PINS: Final = 500
 """Maximum pins of a session. session.json has 150 bytes for each, and is written once in each second in which a pin
-changes. At the limit, a new pin is merged into the newest one of the same cause, even if the two do not touch."""
+changes. At the limit, a new pin is merged into the newest one of the same cause (and condition), even if the two do not
+touch. Only the first pin of a cause or of a condition is still added."""
 _MS_NS: Final = 1_000_000
 
 
@@ -55,7 +56,7 @@ def minute_of(at_ns: int, cause: PinCause, words: str, cars: Iterable[str] = ())
 
 
 class PinList(Struct):
-    """The pins of one session. Pins of one cause that touch each other are merged."""
+    """The pins of one session. A new pin is merged into the newest one of its cause (and condition) that it touches."""
 
     pins: list[Pin] = field(default_factory=list)
 

@@ -79,7 +79,7 @@ class SessionInfo(Struct):
     """Name of the interrupted session that this one continues. Messages that it could not write are backfilled here."""
     format: int = FORMAT_VERSION
     marks: Sequence[Mapping[str, Any]] = ()
-    """Marks set during recording: `time` (ISO 8601), `text`, `by`."""
+    """Marks: `time` (ISO 8601), `text`, `by`. Those that were set after the recording also have `added`."""
     kept: bool = False
     """True if the quota spares the session. The name is part of the file format."""
     stops: int | None = None
@@ -89,7 +89,7 @@ class SessionInfo(Struct):
     gone: Sequence[Mapping[str, Any]] = ()
     """Segments that the quota has removed: `file`, `from`, `to` (ISO 8601), `messages` (null if unknown), `pinned`."""
     origin: Mapping[str, Any] = field(default_factory=dict)
-    """Source session, tool (`recover`, `cut`) and losses. Empty if the session was recorded."""
+    """Source session, tool (`recover`, `cut`, `merge`) and losses. Empty if the session was recorded."""
 
     @classmethod
     def read(cls, directory: Path) -> Self | None:
@@ -129,7 +129,7 @@ def gone_of(info: SessionInfo) -> list[Mapping[str, Any]]:
 
 
 def gone_messages(info: SessionInfo) -> int | None:
-    """Return how many messages the quota has removed, or None if they were not counted."""
+    """Return how many messages the quota has removed, or None if those of one file were not counted."""
     counts = [each.get("messages") for each in info.gone]
     known = [count for count in counts if isinstance(count, int)]
     return sum(known) if len(known) == len(counts) else None
@@ -160,7 +160,7 @@ def indexed_segments(directory: Path) -> list[dict[str, Any]]:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the JSON object in a file, or an empty one if there is no file."""
+    """Return the JSON object in a file. Return an empty one if the file is missing, unreadable, or no JSON object."""
     try:
         values = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
     except (OSError, ValueError, RecursionError):
@@ -184,14 +184,17 @@ def add_mark(directory: Path, at_ns: int, text: str, by: str) -> None:
     path = directory / SESSION_FILE
     if not path.exists():
         raise NoMark(
-            f"it has no {SESSION_FILE}, where marks of closed sessions are stored: `fleet sessions recover` makes one"
+            f"it has no {SESSION_FILE}, where marks of closed sessions are stored: "
+            "`fleet sessions recover` makes a copy with one"
         )
     info = SessionInfo.read(directory)
     if info is None or info.format > FORMAT_VERSION:
         raise NoMark(f"its {SESSION_FILE} cannot be read by this version")
     if not info.closed:
         # A recorder would write its own description over this one.
-        raise NoMark("the recorder has not closed it: `fleet mark` marks now, `fleet sessions recover` closes it")
+        raise NoMark(
+            "the recorder has not closed it: `fleet mark` marks now, `fleet sessions recover` makes a closed copy"
+        )
     mark = {"time": iso(at_ns), "text": text, "by": by}
     if any({name: each.get(name) for name in mark} == mark for each in info.marks):
         return

@@ -1,7 +1,7 @@
 """Finds the session that a name means: a path, a name in the directory of sessions, `latest`, or `latest~1`.
 
 The rule is the same for the command line and Python. `latest` is the session whose recording began last. Sessions that
-a tool made from others (cut, recover) do not count.
+a tool made from others (cut, merge, recover) do not count.
 """
 
 import os
@@ -25,7 +25,7 @@ class NoLatest(LookupError):
 
 
 def sessions_place() -> Path:
-    """Return the directory of sessions: `sessions` here, or the one that the fleet file here names."""
+    """Return the directory of sessions: `sessions` here, or, without it, the one that the fleet file here names."""
     if not DEFAULT_SESSIONS.is_dir() and _FLEET_YAML.is_file():
         from fleet.fleetfile.fleet_file import read_fleet
 

@@ -29,8 +29,8 @@ def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, i
     """Return begin and end, ns, of a time that a person types for a session from `start_ns` to `end_ns`.
 
     A time of day and a date without a zone are local. A time of day without a day is a time within the session. Raises
-    ValueError with the syntax and the range of the session, or with the days if the session has this time of day on
-    several. `now_s` is the wall clock.
+    ValueError. Its text has the range of the session (and the syntax, if the text is not a time), or the days if the
+    session has this time of day on several. `now_s` is the wall clock.
     """
     try:
         return _span_ns(text, start_ns, end_ns, now_s)
@@ -89,7 +89,10 @@ def _date_ns(text: str) -> tuple[int, int]:
 
 
 def ago_s(text: str, now_s: float) -> float:
-    """Return how many seconds ago a time was. The text, the errors and `now_s` are as for `past_ns`."""
+    """Return how many seconds ago a time was. The text, the errors and `now_s` are as for `past_ns`.
+
+    But here a number without a unit is a number of seconds.
+    """
     duration = duration_s(text.removeprefix("-"))
     return now_s - past_ns(text, now_s) / _NS if duration is None else duration
 
@@ -97,8 +100,8 @@ def ago_s(text: str, now_s: float) -> float:
 def past_ns(text: str, now_s: float) -> int:
     """Return a time in the past as a person types it: a duration ago (`5m` or `-5m`), a local time, or a date.
 
-    The result is in ns since the epoch. A time of day without a day is its last occurrence. Raises ValueError with the
-    syntax, also for a time in the future. `now_s` is the wall clock.
+    The result is in ns since the epoch. A time of day without a day is its last occurrence. Raises ValueError for a
+    text that is not a time, and for a time in the future. `now_s` is the wall clock.
     """
     if _NUMBER.fullmatch(text):  # 18.21 may be meant for 18:21
         raise ValueError(f"{text} has no unit: write {text}s for that many seconds ago, or a time such as 14:05.")
@@ -154,7 +157,7 @@ def format_utc(when: datetime, timespec: str = "milliseconds") -> str:
 
 
 def iso(ns: int) -> str:
-    """Return a time in ISO 8601, UTC, with milliseconds."""
+    """Return a time in ISO 8601, UTC, with milliseconds. A time that no date can express becomes a number of ns."""
     try:
         when = datetime.fromtimestamp(ns // 1_000_000_000, UTC)
     except (OverflowError, ValueError, OSError):

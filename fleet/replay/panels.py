@@ -99,7 +99,8 @@ COMMAND_TOPIC: Final = "event/command"
 ASSIGNMENT: Final = "@coordinator/assignment"
 PLAN_TOPIC: Final = "@coordinator/plan"
 ON_CHANGE_TOPICS: Final = (PLAN_TOPIC, ASSIGNMENT)
-"""Topics that are published only on change. So a viewer that starts later must ask for their last message."""
+"""Topics that are published on change, and otherwise every ten seconds. So a viewer that starts later asks for their
+last message."""
 
 DISTANCE: Final = Curve("sensor/range", "range_m!", f"distance ({_unit('sensor/range', 'range_m')})")
 BATTERY: Final = Curve("sensor/battery", "voltage_v", f"battery ({_unit('sensor/battery', 'voltage_v')})")

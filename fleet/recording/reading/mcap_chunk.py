@@ -1,6 +1,7 @@
 """Decodes one chunk of an MCAP file: decompresses it, checks its CRC and splits it into records.
 
-The mcap library is not used for this: it allocates as much as a damaged length says, and takes eight times as long.
+The mcap library does not decompress and split it here: it would allocate as much as a damaged length says, and take
+eight times as long. It parses the head and checks the CRC.
 """
 
 import struct

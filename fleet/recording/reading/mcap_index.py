@@ -16,7 +16,7 @@ from mcap.records import Channel, Schema, Statistics
 from msgspec import Struct, field
 
 MAX_RECORD_BYTES: Final = 80 * 2**20
-"""Maximum size of a record and of a decompressed chunk to read.
+"""Maximum size of a record to read. A chunk may be larger when it is decompressed (`mcap_chunk.MAX_RATIO`).
 
 The recorder accepts messages of up to 64 MiB, and ends a chunk with the message that brings it over 1 MiB.
 """
@@ -105,7 +105,7 @@ class Index(Struct):
 
 
 def read(file: IO[bytes], start: int, end: int) -> Index:
-    """Parse the index between two offsets. Raises errors of the mcap library and struct if it is corrupted."""
+    """Parse the index between two offsets. Raises one of `mcap_chunk.BROKEN` if it is corrupted."""
     index = Index()
     for at, opcode, body in _records(file, start, end):
         match opcode:

@@ -34,7 +34,7 @@ _HEADER_LIMIT: Final = 2**16
 
 
 class NotMcap(Exception):
-    """The file is missing, or it is not an MCAP file. The message gives the reason."""
+    """The file is missing, cannot be read, or is not an MCAP file. The message gives the reason."""
 
 
 class ChannelInfo(NamedTuple):
@@ -102,7 +102,10 @@ class McapReader:
         return self.cut and len(self.damage) == 1
 
     def check(self) -> None:
-        """Check every CRC without parsing messages."""
+        """Check every CRC without parsing messages.
+
+        If a chunk is damaged, do not check attachments, metadata and the bytes between chunks.
+        """
         self._begin()
         try:
             with self.path.open("rb") as file:

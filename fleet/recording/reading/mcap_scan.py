@@ -1,7 +1,8 @@
 """Scans an MCAP file that has no valid index, record by record and past damage. Reads no message.
 
 A damaged length could lead anywhere. So the scan trusts a record only if another record follows it and no intact chunk
-lies inside it. Otherwise the scan reports the damage and continues at the next intact chunk.
+lies inside it. An intact chunk, and a message index whose lengths agree, are trusted even if a damaged record follows.
+Otherwise the scan reports the damage and continues at the next intact chunk.
 """
 
 import os
@@ -25,7 +26,7 @@ _PRIVATE: Final = 0x80
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MAX_COMPRESSION_NAME: Final = 16
 _MESSAGE_INDEX_HEAD: Final = struct.Struct("<HI")  # channel, length of the entries
-# The head of a chunk of at most MAX_RECORD_BYTES bytes.
+# The head of a chunk of less than 96 MiB, which covers all chunks of up to MAX_RECORD_BYTES.
 _CANDIDATE: Final = re.compile(rb"(?=\x06[\s\S]{3}[\x00-\x05]\x00{4})")
 _BLOCK: Final = 2**20
 _MAX_REREADS: Final = 4

@@ -33,7 +33,7 @@ class MessageDecoder:
         return self._classes[kind]
 
     def message(self, info: ChannelInfo, payload: bytes) -> Message | None:
-        """Return the decoded payload, or None if it does not match its schema."""
+        """Return the decoded payload, or None if it does not match its schema, or if `class_of` returns None."""
         message_class = self.class_of(info)
         if message_class is None:
             return None

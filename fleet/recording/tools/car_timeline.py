@@ -48,7 +48,7 @@ class CarTimeline(Struct):
     _last: dict[str, str] = field(default_factory=dict)
 
     def add(self, topic: str, message: Any, at_ns: int) -> None:
-        """Add a message of the car, or a decision of the plan. `at_ns` is its time on the recorder's clock."""
+        """Add a message of the car, or a decision of the plan. `at_ns` is its time, on the clock of `begin_ns`."""
         if topic in TIMELINE_TOPICS:
             self.stops.add(self.car, topic, message, at_ns)
         if topic in _CLAIMS:
@@ -71,7 +71,7 @@ class CarTimeline(Struct):
 
     @property
     def nearest(self) -> list[UnshownStop]:
-        """The stops within the timeline that were not shown."""
+        """The failed stops within the timeline."""
         return [each for each in self.stops.stops if self.begin_ns <= each.at_ns < self.end_ns]
 
     def as_dict(self) -> Mapping[str, Any]:

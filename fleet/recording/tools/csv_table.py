@@ -1,7 +1,8 @@
 """Formats readings of one message type as a CSV table (RFC 4180) for `fleet get --csv`. Pure.
 
-The columns are the time, the key, and every field of the message with its unit in the name. They are always the same
-for a type, and empty where nothing was measured. Numbers, times and booleans are written as in JSON.
+The columns are the time, the key, and the fields of the message with their units in the names. Stamps and the boot id
+are left out. The columns are always the same for a type, except that a list of numbers has as many as its longest
+value. They are empty where nothing was measured. Numbers, times and booleans are written as in JSON.
 """
 
 import csv

@@ -3,7 +3,8 @@
 The console draws them live, and for a session. Times are by one clock that the caller chooses, ns since the epoch. For
 a session this is the recorder's clock, because the clock of a gateway may be wrong.
 
-A state lasts until the next one, or until it is stale. So nothing is drawn for times without messages.
+A state lasts until the next one. If that one comes only after the state is stale, the state ends with its own message.
+So nothing is drawn for times without messages.
 A stop begins when it arrived, and ends with its last event.
 """
 
@@ -121,7 +122,7 @@ class Lanes(Struct):
     def silences(self, now_ns: int) -> Iterator[LaneSpan]:
         """Yield a loss for each car that has been silent for too long by now.
 
-        No later message may come to end the loss.
+        `add` adds a loss only when the car is heard again, and perhaps it never is.
         """
         for car, heard_ns in sorted(self._heard_ns.items()):
             if now_ns - heard_ns > HELD_NS:

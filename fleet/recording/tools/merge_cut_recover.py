@@ -23,7 +23,7 @@ from fleet.recording.tools.tables import car_of
 
 COPIED: Final = ("fleet.yaml", "plan.yaml")
 MAX_SEGMENT_PAYLOAD_BYTES: Final = 256 << 20
-"""Maximum size of the payloads in one segment."""
+"""Size of the payloads in one segment. The message that reaches it is the last one."""
 
 
 class Exists(Exception):
@@ -128,8 +128,9 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
     """Write the messages of several sessions of one fleet, in the order of their recorders' clocks.
 
     A message that several recorders received is written once. It is recognized by its key, number, publish time and
-    payload. Return the number of messages, the number of duplicates, and the losses in words. Raises Exists, OSError,
-    and NoSession if the sessions are of several fleets, or none has an intact message.
+    payload. A message without a number is written each time. Return the number of messages, the number of duplicates,
+    and the losses in words. Raises Exists, OSError, and NoSession if the sessions are of several fleets, or none has an
+    intact message.
     """
     fleets = {each.description.fleet for each in sessions if each.description is not None}
     if len(fleets) > 1:
@@ -251,7 +252,7 @@ def _described(
 
 
 def _copy_others(session: Session, new: Path) -> None:
-    """Copy the files of the old session that are neither segments nor its description."""
+    """Copy the fleet file and the plan of the old session, if it has them."""
     if session.path.is_dir():
         for name in COPIED:
             if (session.path / name).is_file():

@@ -33,10 +33,11 @@ class Known(Struct, frozen=True):
 
 
 def known_at(session: Session, at_ns: int, *, before_ns: int = STATE_BEFORE_NS) -> list[Known]:
-    """Return the newest message of each key up to a moment, by the time at which it was recorded.
+    """Return, of the messages of each key that were recorded up to a moment, the one that was published last.
 
-    Only the time `before_ns` before the moment is searched. Gateways repeat their states each second, so older states
-    are no longer in force. Messages that are not of their key's type are left out.
+    They are sorted by the time at which they were recorded. Only the time `before_ns` before the moment is searched.
+    Gateways repeat their states each second, so older states are no longer in force. Messages that are not of their
+    key's type are left out.
     """
     newest = newest_rows(session.rows(Selection(None, at_ns - before_ns + 1, at_ns + 1)))
     return sorted(_decoded(newest.values()), key=lambda each: each.log_ns)
@@ -79,7 +80,7 @@ def one_a_step(rows: Iterable[Row], step_ns: int) -> Iterator[Row]:
 def newest_of(session: Session, expressions: tuple[str, ...], at_ns: int) -> list[Known]:
     """Return the newest message of some keys up to a moment, however old.
 
-    Use it for keys that are published on change.
+    Use it for keys that are seldom published.
     """
     return list(_decoded(newest_rows(session.rows(Selection(expressions, 0, at_ns + 1))).values()))
 
@@ -97,7 +98,7 @@ def lanes_of(session: Session) -> Lanes:
 
 
 _LATEST_NS: Final = 2**63 - 2
-"""The latest time that a file can contain."""
+"""Later than any time of a real clock: the year 2262."""
 
 
 def _decoded(rows: Iterable[Row]) -> Iterator[Known]:

@@ -1,7 +1,7 @@
 """Writes a session as one MCAP file in which each topic has one schema, as Foxglove and PlotJuggler expect it.
 
-A message whose type does not fit its key gets another topic: `stray/KEY/TYPE`. Nothing else changes: payloads,
-times, sequences, attachments and metadata are those of the session.
+A message whose type does not fit its key, or whose schema is not the first one of its key, gets another topic:
+`stray/KEY/TYPE`. Nothing else changes: payloads, times, sequences, attachments and metadata are those of the session.
 """
 
 from collections.abc import Iterable

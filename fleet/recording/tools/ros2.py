@@ -3,8 +3,8 @@
 A topic is `/<car>/<topic>`, as in `/red/range`. If ROS has a standard message for a reading, that message is used, with
 ROS's units and its value for "not measured". Everything else becomes a DiagnosticArray with all fields as text, so no
 message of the fleet is lost. Stamps are by the gateway's clock, the times of the bag by the recorder's clock. Frames
-are `<car>/<topic>`, as in `red/range`. There are no transforms, because nobody has measured where the sensors sit on
-the cars.
+are `<car>/<topic>`, as in `red/range`, except that poses are in the frame of their map. There are no transforms,
+because nobody has measured where the sensors sit on the cars.
 """
 
 import json
@@ -78,7 +78,7 @@ def _quaternion(roll: float, pitch: float, yaw: float) -> Any:
 
 
 def _range(message: Any, header: Any) -> Any:
-    """Return the distance, or +inf if there was no echo (REP-117)."""
+    """Return the distance, +inf if there was no echo (REP-117), or NaN if nothing was measured."""
     measured = message.range_m if message.HasField("range_m") else _NAN
     return _ros(
         "sensor_msgs/msg/Range",
@@ -216,7 +216,10 @@ DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 
 
 def _diagnostics(message: Message, header: Any, key: str) -> Any:
-    """Return all fields of a message as text: numbers, lists and nested messages as JSON, times in ns, bytes in hex."""
+    """Return the fields of a message as text: numbers, lists and nested messages as JSON, times in ns, bytes in hex.
+
+    Leave out unset fields, and those that are in the header or in the name of the topic.
+    """
     values = [
         _ros("diagnostic_msgs/msg/KeyValue", key=name, value=value if isinstance(value, str) else json.dumps(value))
         for name, value in plain(message).items()

@@ -32,6 +32,7 @@ class UnshownStop(Struct):
 
     car: str
     at_ns: int
+    """The stamp of its record, by the clock of the car's gateway, ns since the epoch."""
     code: str
     asked: str
     """The verb and the sender, such as `stop by mia`. Empty if the gateway itself stopped the car."""
@@ -61,7 +62,7 @@ class UnshownStop(Struct):
 
 
 class StopFindings(Struct):
-    """The failed stops of one session, in the order of their times."""
+    """The failed stops of one session, in the order of their messages."""
 
     stops: list[UnshownStop] = field(default_factory=list)
     _states: dict[str, dict[str, Any]] = field(default_factory=dict)

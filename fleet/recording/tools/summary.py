@@ -1,4 +1,7 @@
-"""Summarizes a session without reading its messages, from session.json and the index of each file."""
+"""Summarizes a session from session.json and the index of each file.
+
+It reads messages only where these do not suffice: in a file without a complete index, and to count stops.
+"""
 
 import shlex
 import time
@@ -33,7 +36,7 @@ class SessionState(StrEnum):
 
     WHOLE = "whole"
     RECORDING = "recording"
-    CUT = "cut"  # the recorder did not close it
+    CUT = "cut"  # the recorder did not close it, or a file has no end
     DAMAGED = "damaged"  # files, session.json or messages are missing, or a file is not an MCAP file
     THINNED = "thinned"  # whole, except for files that the quota removed
     RECOVERED = "recovered"  # whole, but made from an incomplete session
@@ -57,7 +60,7 @@ class SessionSummary(Struct):
     bytes: int = 0
     messages: int = 0
     lost: int = 0
-    """Messages that the recorder dropped, or knew to have missed on the bus."""
+    """Messages that the recorder dropped, or knew to have missed on the bus, and those that a tool could not read."""
     cars: Sequence[str] = ()
     stops: int | None = None
     """Commands that stop cars. A stop of several cars counts once. None if they were not counted."""
@@ -80,7 +83,7 @@ class SessionSummary(Struct):
 
 
 def overviews(root: Path) -> Iterator[SessionSummary]:
-    """Yield every session below a directory, oldest first. Raises OSError if the directory cannot be listed."""
+    """Yield every session in a directory, by name. Raises OSError if the directory cannot be listed."""
     yield from map(overview, filter(session_dir.is_session, sorted(root.iterdir())))
 
 
@@ -242,7 +245,7 @@ def _state(session: Session, read: Session) -> tuple[SessionState, str]:
             return SessionState.RECORDING, ""
         return (
             SessionState.CUT,
-            description.error or f"the recorder did not close it: `{_recover(session)}` makes it whole",
+            description.error or f"the recorder did not close it: `{_recover(session)}` repairs it",
         )
     if damaged := sorted(read.damage.keys() - read.unended):
         return SessionState.DAMAGED, f"{damaged[0].name} {read.damage[damaged[0]]}"

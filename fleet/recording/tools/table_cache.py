@@ -7,9 +7,9 @@ questions make it at the same time, one of the two is kept. Deleting a directory
 are not those of this version is named `.foreign.parquet`.
 
 Reading the descriptions of a thousand sessions takes as long as a question. So a directory has a stamp: an empty file
-whose name covers the sizes and times of all files and of the description. While the stamp fits, the description is not
-read. A new mark changes the description, so the stamp no longer fits, and the description is read. If it says nothing
-new about the messages, the tables stay, and only the stamp is replaced.
+whose name covers the sizes and times of the segments, of the description and of index.json. While the stamp fits, the
+description is not read. A new mark changes the description, so the stamp no longer fits, and the description is read.
+If it says nothing new about the messages, the tables stay, and only the stamp is replaced.
 """
 
 import errno
@@ -87,7 +87,7 @@ class CachedTables(Struct, frozen=True):
         return cls(session, directory, note.read_text(encoding="utf-8") if _NOTE in names else "", names)
 
     def with_words_of_now(self) -> Self:
-        """Return the tables. If the session was being recorded when they were made, update `words` to its state now."""
+        """Return the tables. If they had no `words` and the session was not closed, set `words` to its state now."""
         return replace(self, words=self.words or _words(Session(self.session))) if _OPEN in self.names else self
 
     def files(self, message: str) -> Iterator[Path]:
@@ -123,7 +123,8 @@ class CachedTables(Struct, frozen=True):
 def tables_of(session: Path) -> CachedTables:
     """Return the tables of a session. Make them now if they do not exist.
 
-    Raises NoSession, FormatMissing, and OSError if they can be written neither in the session nor elsewhere.
+    Raises NoSession, FormatMissing, and OSError if they can be written neither in the session nor elsewhere, or if the
+    session grows too fast.
     """
     for _ in range(_MAX_TRIES):
         state = _State.of(session)
@@ -250,7 +251,7 @@ def _drop_others(place: Path) -> None:
 
 
 def _homes(session: Path) -> Iterator[Path]:
-    """Yield the places where the tables may be: in the session, or among temporary files if the folder is read-only."""
+    """Yield the places where the tables may be: in the session, or among temporary files if that is not possible."""
     home = session if session.is_dir() else session.parent / f".{session.name}"
     yield home
     owner = hashlib.sha256(str(home.absolute()).encode()).hexdigest()[:12]

@@ -70,7 +70,7 @@ OTHER_COLUMNS: Final = (
     Column("text", ColumnKind.TEXT),
     Column("data", ColumnKind.BYTES),
 )
-"""Columns of messages that are not protobuf: UTF-8 as text, other payloads as bytes."""
+"""Columns of messages that are not decoded, mostly because they are not protobuf: UTF-8 as text, others as bytes."""
 
 _COLUMN_KINDS: Final = {
     FieldDescriptor.CPPTYPE_DOUBLE: ColumnKind.FLOAT,

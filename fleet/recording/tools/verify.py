@@ -19,7 +19,7 @@ from schemas.printable import printable
 MAX_CLOCK_OFFSET_S: Final = 0.5
 """A larger offset of a publisher's clock from the recorder's clock is reported."""
 MAX_LISTED_LINES: Final = 20
-"""Maximum number of gaps to print. --json lists all."""
+"""Maximum number of gaps to print, and of duplicates and of clock steps. --json lists all."""
 
 
 class Clock(Struct):
@@ -72,7 +72,10 @@ class SessionVerdict(Struct):
 
     @property
     def whole(self) -> bool:
-        """True if no message is missing or duplicated, and no file damaged."""
+        """True if no message is missing, duplicated or undecodable, no file is damaged or removed, and it was closed.
+
+        A session that is being recorded need not be closed.
+        """
         return (self.closed or self.recording) and not any(
             (self.damage, self.lost, self.gone, self.missing, self.twice, self.dropped, self.missed, self.undecoded)
         )
@@ -234,7 +237,7 @@ def verify(
     with_progress: Callable[[Iterable[Row]], Iterable[Row]] = iter,
     recording: Callable[[], bool] = lambda: False,
 ) -> SessionVerdict:
-    """Verify every byte and message. `with_progress` shows the progress; `recording` is called at the end."""
+    """Read every message and check the CRCs. `with_progress` shows the progress; `recording` is called at the end."""
     verdict = SessionVerdict(str(session.path))
     verifier = _Verifier(verdict)
     for row in with_progress(session.rows()):

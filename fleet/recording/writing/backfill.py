@@ -3,7 +3,8 @@
 A recording has holes exactly where they matter most: the moment when the network broke is the moment that somebody will
 want to look at. A subscriber alone cannot prevent that, because messages that were published while it was away are
 gone. So each publisher caches its last publications: ten seconds at the rate of its topic, but at least a hundred
-(`Topic.cache_size`). For a state this is minutes, for an event hours. backfill_plan.py decides who is asked, and when.
+(`Topic.cache_size`). For a state this is up to 100 s, for an event perhaps hours. backfill_plan.py decides who is
+asked, and when.
 
 Messages that cannot be fetched are not hidden: the writer counts them, the status shows the count, and `sessions
 verify` lists the gaps.

@@ -65,7 +65,7 @@ class StoredSession(Struct, frozen=True):
 
 
 class Taking(Struct):
-    """Segments, tables and whole sessions that the quota removes, in this order."""
+    """Segments, tables and whole sessions that the quota removes."""
 
     segments: list[StoredSegment] = field(default_factory=list)
     tables: list[str] = field(default_factory=list)

@@ -1,7 +1,7 @@
 """Removes recordings that exceed the quota of a recorder (fleet/quota.py). quota_choice.py decides what is removed.
 
-All removals are listed: segments in the session.json of their session, whole sessions in `removed.json` beside the
-sessions.
+Removed recordings are listed: segments in the session.json of their session, whole sessions in `removed.json` beside
+the sessions.
 """
 
 import contextlib
@@ -44,8 +44,8 @@ class Enforced(Struct):
 def enforce(quota: Quota, root: Path, keep: Path, pins: Iterable[Pin] = ()) -> Enforced:
     """Remove segments below `root` until all sessions fit.
 
-    Spare `keep`, marked sessions, directories of other programs and sessions that cannot be changed. pins: the pins of
-    `keep`, because its session.json may not have them yet.
+    Spare `keep`, marked sessions, sessions in use, directories of other programs and sessions that cannot be changed.
+    pins: the pins of `keep`, because its session.json may not have them yet.
     """
     done = Enforced()
     if not quota.total:  # without a quota, do not even look at the disk
@@ -128,7 +128,7 @@ def _take(session: Path, info: SessionInfo, taking: Taking, done: Enforced) -> i
         if session.name in taking.removed:
             _remove(session)
             done.removed.append(session)
-            done.news.append(f"{session} is removed, the oldest session without a mark: the quota is full")
+            done.news.append(f"{session} is removed, because the quota is full")
             with contextlib.suppress(OSError):  # the disk is full, but the news names the session, too
                 _list_removed(session, info, segments)
             return before

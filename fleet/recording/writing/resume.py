@@ -11,7 +11,7 @@ from fleet.recording.time_spec import iso_ns
 from schemas.topics import CACHE_S
 
 RESUME_WINDOW_S: Final = 3 * CACHE_S
-"""Time before the end of an interrupted session from which publishers may still cache messages."""
+"""Time before the start of the new session from which publishers may still cache messages."""
 
 
 class ResumePoint(Struct, frozen=True):
@@ -26,7 +26,10 @@ class ResumePoint(Struct, frozen=True):
 
 
 def find_interrupted(root: Path, fleet: str, now_ns: int) -> ResumePoint:
-    """Return the resume point of the latest session below `root`. It has no name if that session was closed."""
+    """Return the resume point of the latest session below `root`.
+
+    It has no name if that session has an end, cannot be read, or was last written more than 2 * CACHE_S ago.
+    """
     session = _find_latest(root, fleet, now_ns)
     if session is None:
         return ResumePoint("", now_ns)

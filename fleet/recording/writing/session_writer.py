@@ -131,7 +131,7 @@ class SessionWriter:
         source: zenoh.SourceInfo | None,
         received_ns: int,
     ) -> None:
-        """Write one publication unchanged."""
+        """Write one publication unchanged, unless a backfill brought it before."""
         # Every message takes this path, and each call costs time. So the usual case, a consecutive number, is checked
         # here.
         state = self._states.get(key)
@@ -160,7 +160,10 @@ class SessionWriter:
             self._put(state.channel, received_ns, payload, published_ns, sequence)
 
     def add_backfilled(self, sample: zenoh.Sample, received_ns: int) -> bool:
-        """Write a backfilled publication. Return False if it is recorded already, or older than the session."""
+        """Write a backfilled publication.
+
+        Return False if it is recorded already, is older than the session, or has no number or no time.
+        """
         source, stamp = sample.source_info, sample.timestamp
         if source is None or stamp is None:
             return False

@@ -61,7 +61,10 @@ class Counts(Struct):
 
 
 class NoPlatform(Exception):
-    """The recording does not contain the platform of a car. The message says what to do."""
+    """The recording does not contain the platform of a car, or its frames cannot be decoded again.
+
+    The message says what to do.
+    """
 
 
 class Redecoding(Struct):
@@ -95,7 +98,7 @@ class Redecoding(Struct):
             yield from self._judge(self._waiting.popleft())
 
     def end(self) -> Iterator[ReadingDifference]:
-        """Yield the differences of the remaining frames."""
+        """Yield the differences of the remaining frames. Raises NoPlatform."""
         while self._waiting:
             yield from self._judge(self._waiting.popleft())
 
@@ -143,8 +146,8 @@ class Redecoding(Struct):
         for name in names:
             try:
                 if drivers.family_name(name) != drivers.YAHBOOM:
-                    words = f"{self.car} is of platform {name}, whose frames are not decoded again. Leave it out: --car"
-                    raise NoPlatform(words)
+                    words = f"{self.car} is of platform {name}, whose frames are not decoded again."
+                    raise NoPlatform(f"{words} Name the other cars: --car")
                 found.append(parse_platform(name))
             except ValueError:
                 raise NoPlatform(

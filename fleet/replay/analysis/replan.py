@@ -2,7 +2,7 @@
 
 Cars behave as recorded, whatever this plan would have commanded. A recording lacks three things that a live coordinator
 knows: the liveliness tokens (see recorded_decisions.py), the exact times of the coordinator's steps (here there is a
-step after every message, and ten times a second), and the order of messages that arrived almost at once.
+step after the messages of each 10 ms, and ten times a second), and the order of messages that arrived almost at once.
 """
 
 import contextlib

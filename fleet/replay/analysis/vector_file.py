@@ -35,7 +35,8 @@ class BadVector(Exception):
 def select_range(items: Iterable[Item], start_ns: int, end_ns: int | None) -> Iterator[Item]:
     """Yield the known mode and platform at the start of a time range, then its frames.
 
-    The items are in order and begin `BEFORE_NS` before the range.
+    Also yield frames to the car from just before, because their echoes may be in the range. The items are in order and
+    begin `BEFORE_NS` before the range.
     """
     known: dict[type, Item] = {}
     is_inside = False

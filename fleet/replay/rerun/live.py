@@ -36,7 +36,7 @@ VIEW_QUEUE_SIZE: Final = 16_384
 MAX_WAITING_MESSAGES: Final = 50_000
 """Maximum number of messages in the queue to the viewer."""
 MAX_PATH_POINTS: Final = 3_000
-"""Maximum number of points of the path of each simulated car: five minutes."""
+"""Maximum number of points of the path of each car: five minutes of a simulated car, which publishes ten a second."""
 DEFAULT_VIEW_S: Final = 120.0
 """Time span that the view shows by default. It can also show all."""
 VIEWER_FLUSH_TIMEOUT_S: Final = 2.0
@@ -73,7 +73,7 @@ class Live:
         sink(self._recording)
 
     def start(self) -> None:
-        """Subscribe, and query the topics that are published only on change."""
+        """Subscribe, and query the topics of ON_CHANGE_TOPICS."""
         for expression in keys.recorded_keys(self._fleet):
             self._subscribers.append(self._bus.subscribe_channel(expression, VIEW_QUEUE_SIZE))
         self._reader.start()
@@ -84,7 +84,7 @@ class Live:
                 self._queue += answers
 
     def step(self) -> int:
-        """Send the new messages, and return their number."""
+        """Send the new messages that Rerun can show, and return the number of all new ones."""
         if self._viewer_stalled and not self._flush():
             return 0
         with self._lock:

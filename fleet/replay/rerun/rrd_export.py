@@ -1,7 +1,7 @@
 """Exports a session to an .rrd file with its layout, using Rerun's MCAP reader and lenses.
 
-Also counts the messages of an .rrd. The .rrd contains every message unchanged. lenses.py and drawings.py add what the
-viewer draws.
+Also counts the messages of an .rrd. The .rrd contains every message that Rerun can read, unchanged. lenses.py and
+drawings.py add what the viewer draws.
 """
 
 import re
