@@ -228,7 +228,7 @@ CAR_METRICS: Final = (
     ),
     CarMetric(
         "fleet_car_rejected_frames",
-        "frames of the car that could not be understood",
+        "frames or bytes of the car that gave no readings or were not used, and troubles of its link",
         Unit.NONE,
         _COUNTER,
         panel="Trouble of links",

@@ -3,8 +3,8 @@
 A topic is `/<car>/<topic>`, as in `/red/range`. If ROS has a standard message for a reading, that message is used, with
 ROS's units and its value for "not measured". Everything else becomes a DiagnosticArray with all fields as text, so no
 message of the fleet is lost. Stamps are by the gateway's clock, the times of the bag by the recorder's clock. Frames
-are `<car>/<topic>`, as in `red/range`, except that poses are in the frame of their map. There are no transforms,
-because nobody has measured where the sensors sit on the cars.
+are `<car>/<topic>`, as in `red/range`, except for poses: a measured one has the frame that it names, a true one has
+`world`. There are no transforms, because nobody has measured where the sensors sit on the cars.
 """
 
 import json

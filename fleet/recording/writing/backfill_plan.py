@@ -59,7 +59,7 @@ class _Asked(Struct):
     due: list[tuple[float, float]] = field(default_factory=list)
     """When to ask, and since when messages may be missing."""
     unanswered_since: float = inf
-    """The earliest time from which a query asked for messages that was not answered yet, or inf."""
+    """The earliest time from which messages were asked for without a complete answer so far, or inf."""
     keys: dict[str, int] = field(default_factory=dict)
     """Keys with gaps, each with the number of answers that did not contain it. A car has several publishers, so an
     answer of another one does not count as an answer for this key."""

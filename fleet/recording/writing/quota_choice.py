@@ -3,9 +3,9 @@
 The unit is a segment, which is one file: with a quota, one minute. A segment is pinned if a pin of any session of its
 fleet touches its time, because the time before a pin may be in another session.
 
-Unpinned segments are removed first, the oldest of all sessions before the others. Pinned segments may fill half of the
-quota. If they fill more, the oldest of them are removed before anything else. So even if a condition is always true,
-there is room for new recordings. The tables of a session (for SQL questions) are removed with its first segment,
+Pinned segments may fill half of the quota. If they fill more, the oldest of them are removed first, until they fill
+half. So even if a condition is always true, there is room for new recordings. Then unpinned segments are removed, the
+oldest first, whatever their sessions. The tables of a session (for SQL questions) are removed with its first segment,
 because they no longer fit. If only pinned segments are left, all tables are removed, because they can be made again.
 Pinned segments may fill their half even if marked sessions, which are never removed, fill the rest: then everything
 together exceeds the quota, and the recorder warns.

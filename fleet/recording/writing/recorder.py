@@ -61,8 +61,8 @@ MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
 MAX_PENDING_QUERIES: Final = 64
 MAX_STOP_S: Final = 8.0
-"""Maximum time for which a session that is to be closed waits for its missing messages. Before it, the people may have
-to be asked for (STATUS_TIMEOUT_S), and clients wait 15 s for the answer."""
+"""Maximum time for which a session that is to be closed waits for its missing messages. Before that, the recorder may
+ask the gateways who may stop it (STATUS_TIMEOUT_S). Clients wait 15 s for the answer to both."""
 
 
 class RecordingFailed(Exception):
