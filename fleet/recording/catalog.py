@@ -4,7 +4,8 @@
 `fleet sessions export` and the name of the `session`. `sensor_range_context` adds what was true at that time: the mode
 as commanded and as seen, the motion, who drove, and the phase of the plan. The columns `owner` and `driver` of the
 context are persons. `sender` and other columns are as recorded: `person_of(sender)` is the person. Topics without a
-message have views, too.
+message have views, too. Sessions that a tool made from others (cut, merge, recover) count like all others. So if both
+are in the directory, their common messages are in a view twice.
 
 A view is defined only when a question names it or asks which views there are, because DuckDB then opens its files: a
 thousand sessions have twenty files each.
