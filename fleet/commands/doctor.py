@@ -19,7 +19,7 @@ from fleet.commands.which_fleet import open_client
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.session_dir import is_session
 from fleet.recording.tools.session_findings import SessionCheckup
-from fleet.recording.tools.summary import growth_check, total
+from fleet.recording.tools.summary import growth_check, total, typed_name
 from fleet.recording.tools.verify import verify
 from schemas.suggestion import did_you_mean
 
@@ -104,9 +104,9 @@ def _show_session(path: Path, car: str, *, as_json: bool) -> None:
     if car and car not in checkup.cars:
         near = did_you_mean(car, checkup.cars) or f"Cars: {', '.join(sorted(checkup.cars))}."
         raise click.ClickException(f'No car "{car}" in {session.name}. {near}')
-    findings = list(checkup.findings(verdict, session.name))
+    findings = list(checkup.findings(verdict, typed_name(session)))
     if as_json:
-        click.echo(json.dumps(checkup.as_dict(verdict, session.name)))
+        click.echo(json.dumps(checkup.as_dict(verdict, typed_name(session))))
     else:
         echo_safely(_first_line(session.name, findings))
         _show(findings, checkup.facts(verdict))

@@ -9,7 +9,6 @@ import click
 
 from fleet.commands.output import echo_safely
 from fleet.recording import time_spec
-from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.car_timeline import (
@@ -21,6 +20,8 @@ from fleet.recording.tools.car_timeline import (
     CarTimeline,
     message_time_ns,
 )
+from fleet.recording.tools.moment import known_message
+from fleet.recording.tools.recorder_clock import RecorderClock
 from fleet.recording.tools.summary import of_session
 from schemas import keys
 from schemas.local_time import date_and_clock
@@ -54,12 +55,13 @@ def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
         timeline.begin_ns - STATE_BEFORE_NS,
         timeline.end_ns,
     )
-    decoder = MessageDecoder()
-    for info, _, log_ns, _, data in session.rows(selection):
-        key, message = keys.parse(info.channel.topic), decoder.message(info, data)
-        if key is not None and message is not None:
+    recorder_clock = RecorderClock()
+    for each in map(known_message, session.rows(selection)):
+        if each is not None:
+            key = each.key
             topic = f"{key.car}/{key.topic}" if key.car.startswith("@") else key.topic
-            timeline.add(topic, message, message_time_ns(message, log_ns))
+            stamp_ns = message_time_ns(each.message, each.publish_ns)
+            timeline.add(topic, each.message, recorder_clock.at_ns(key.car, stamp_ns, each.log_ns))
     if as_json:
         click.echo(json.dumps(timeline.as_dict()))
         return

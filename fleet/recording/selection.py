@@ -76,5 +76,6 @@ def _pattern(expression: str) -> re.Pattern[str]:
         elif chunk == "*":
             parts.append("[^@/][^/]*/")
         else:
-            parts.append("[^/]*".join(re.escape(part) for part in chunk.split("$*")) + "/")
+            first = "(?!@)" if chunk.startswith("$*") else ""
+            parts.append(first + "[^/]*".join(re.escape(part) for part in chunk.split("$*")) + "/")
     return re.compile("".join(parts))

@@ -100,7 +100,7 @@ class SessionInfo(Struct):
             if not _is_valid(values):
                 return None
             return cls(**{name: values[name] for name in cls.__struct_fields__ if name in values})
-        except (OSError, ValueError, TypeError, AttributeError):
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError):
             return None
 
     def write(self, directory: Path) -> None:
@@ -139,7 +139,7 @@ def add_gone(directory: Path, gone: Sequence[Mapping[str, Any]]) -> None:
     """List in `session.json` the segments that the quota removes. Raises OSError, also if the file cannot be read."""
     path = directory / SESSION_FILE
     values = read_json(path)
-    if not _is_valid(values):
+    if not values or not _is_valid(values):
         raise OSError(errno.EIO, "is not a description", str(path))
     listed = {each.get("file"): each for each in values.get("gone", [])}
     listed |= {each["file"]: each for each in gone}
@@ -234,6 +234,7 @@ def replace(path: Path, values: object, indent: int | None = None) -> None:
 
 
 _LISTS: Final = ("marks", "pins", "gone")
+_TEXTS: Final = {"marks": ("time", "text", "by"), "pins": ("from", "to", "cause", "words")}
 _COUNTS: Final = ("drops", "missed", "recovered")
 _FIELD_TYPES: Final[Mapping[str, type]] = {
     **dict.fromkeys(("fleet", "started", "host", "error", "continues"), str),
@@ -249,6 +250,12 @@ def _is_valid(values: Mapping[str, Any]) -> bool:
         all(isinstance(values[name], kind) for name, kind in _FIELD_TYPES.items() if name in values)
         and all(isinstance(count, int) for name in _COUNTS for count in values.get(name, {}).values())
         and all(isinstance(each, dict) for name in _LISTS for each in values.get(name, []))
+        and all(
+            isinstance(each.get(text), str | None)
+            for name, texts in _TEXTS.items()
+            for each in values.get(name, [])
+            for text in texts
+        )
         and isinstance(values.get("ended"), str | None)
         and isinstance(values.get("stops"), int | None)
     )

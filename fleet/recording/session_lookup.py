@@ -68,6 +68,8 @@ def find_session(session: str | os.PathLike[str], place: Path | None = None) -> 
     if match is None:
         return place / path if os.path.exists(place / path) else path  # noqa: PTH110
     found = newest_first(place)
+    if not found and any(sessions_in(place)):
+        raise NoLatest(f"All sessions in {place} are made of others: name one of them (`fleet sessions` lists them).")
     if not found:
         raise NoLatest(f"No recordings here yet (in {place}). `fleet up` records everything.")
     back = int(match[1] or 0)

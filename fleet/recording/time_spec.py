@@ -18,6 +18,8 @@ _MAX_DAYS: Final = 3
 
 _DATE: Final = re.compile(r"\d{4}-\d{2}-\d{2}")
 _NUMBER: Final = re.compile(r"-?\d+([.,]\d+)?")
+_OFFSET: Final = re.compile(r"[+-]\d{2}:?\d{2}$")
+"""The offset of a zone from UTC, at the end of a time."""
 
 
 def at_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> int:
@@ -85,7 +87,7 @@ def _date_ns(text: str) -> tuple[int, int]:
         near = f" Minutes and seconds are written as {typed[1]}m{typed[2]}s." if typed else ""
         raise _Unreadable(f"{text!r} is not a time.{near}") from None
     begin_ns = whole * _NS + when.microsecond * 1000
-    return begin_ns, begin_ns + clock_length_ns(text.partition("+")[0])
+    return begin_ns, begin_ns + clock_length_ns(_OFFSET.sub("", text))
 
 
 def ago_s(text: str, now_s: float) -> float:

@@ -38,7 +38,7 @@ class TimelineEntry(Struct, frozen=True):
 
 
 class CarTimeline(Struct):
-    """The timeline of one car from `begin_ns` to `end_ns`."""
+    """The timeline of one car from `begin_ns` to `end_ns`, by the recorder's clock."""
 
     car: str
     begin_ns: int
@@ -48,7 +48,7 @@ class CarTimeline(Struct):
     _last: dict[str, str] = field(default_factory=dict)
 
     def add(self, topic: str, message: Any, at_ns: int) -> None:
-        """Add a message of the car, or a decision of the plan. `at_ns` is its time, on the clock of `begin_ns`."""
+        """Add a message of the car, or a decision of the plan. `at_ns` is its time by the recorder's clock."""
         if topic in TIMELINE_TOPICS:
             self.stops.add(self.car, topic, message, at_ns)
         if topic in _CLAIMS:

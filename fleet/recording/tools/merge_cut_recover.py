@@ -7,6 +7,7 @@ import heapq
 import json
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,7 @@ from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_reader import Extra, Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import EVERYTHING, Selection
+from fleet.recording.tools.merged_losses import MergedLosses
 from fleet.recording.tools.tables import car_of
 
 COPIED: Final = ("fleet.yaml", "plan.yaml")
@@ -106,11 +108,12 @@ def cut(
     """
     names = frozenset(cars)
 
+    def is_chosen(key: str) -> bool:
+        car = car_of(key)
+        return (not names or car in names or car.startswith("@")) and selection.has_key(key)
+
     def part() -> Iterator[Row]:
-        for row in session.rows(selection):
-            car = car_of(row[0].channel.topic)
-            if not names or car in names or car.startswith("@"):
-                yield row
+        return (row for row in session.rows(selection) if is_chosen(row[0].channel.topic))
 
     with atomic_directory(out) as new:
         count = _copy(with_progress(part()), new, session)
@@ -119,7 +122,12 @@ def cut(
             raise NoSession(f"{session.path} has no messages there")
         bounds = [None if ns is None else time_spec.iso(ns) for ns in (selection.start_ns, selection.end_ns)]
         about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": lost}
-        _described(session, new, count, about, selection).write(new)
+        made = _described(session, new, count, about, selection)
+        # The recorder has counted its losses for the whole session. In a part of that time, `verify` finds those that
+        # are inside by the numbers of the messages.
+        kept = is_chosen if bounds == [None, None] else lambda _key: False
+        drops, missed = ({key: lost for key, lost in each.items() if kept(key)} for each in (made.drops, made.missed))
+        replace(made, drops=drops, missed=missed).write(new)
         _copy_others(session, new)
     return count
 
@@ -136,10 +144,12 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
     if len(fleets) > 1:
         raise NoSession(f"these are sessions of several fleets: {', '.join(sorted(fleets))}")
     twice, counts = 0, [0] * len(sessions)
+    losses = MergedLosses([each.description for each in sessions])
 
     def counted(number: int) -> Iterator[Row]:
         for row in sessions[number].rows():
             counts[number] += 1
+            losses.on_read(number, row[0].channel.topic)
             yield row
 
     def once() -> Iterator[Row]:
@@ -153,6 +163,7 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
                 twice += 1
                 continue
             seen.add(told)
+            losses.on_written(info.channel.topic, row[2])
             yield row
 
     with atomic_directory(out) as new:
@@ -171,7 +182,10 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
         started = min((each.started for each in described), default=made.started)
         origin = {**made.origin, "of": about["of"], "lost": lost, "missing": None if lost else 0}
         kept = any(each.kept for each in described)
-        replace(made, marks=marks, pins=pins, kept=kept, started=started, origin=origin).write(new)
+        drops, missed = losses.remaining()
+        made = replace(made, marks=marks, pins=pins, kept=kept, started=started, origin=origin)
+        recovered = sum((Counter(each.recovered) for each in described), Counter[str]())
+        replace(made, drops=drops, missed=missed, recovered=dict(recovered)).write(new)
         _copy_others(sessions[0], new)
     return count, twice, lost
 

@@ -102,11 +102,20 @@ _LATEST_NS: Final = 2**63 - 2
 
 
 def _decoded(rows: Iterable[Row]) -> Iterator[Known]:
-    """Yield the messages with our own classes. That works because a schema only gains fields."""
-    for info, _, log_ns, publish_ns, data in rows:
-        key = keys.parse(info.channel.topic)
-        topic = None if key is None else TOPICS.get(key.topic) or TOPICS.get(f"{key.car}/{key.topic}")
-        if key is None or topic is None or message_of(info) != topic.message:
-            continue
-        with suppress(DecodeError):
-            yield Known(key, messages.message_class(topic.message).FromString(data), log_ns, publish_ns)
+    yield from (known for row in rows if (known := known_message(row)) is not None)
+
+
+def known_message(row: Row) -> Known | None:
+    """Return the message of a row, decoded with our own class, or None if it is not of its key's type.
+
+    A message of an older version lacks fields, which then have their default values. That works because a schema only
+    gains fields.
+    """
+    info, _, log_ns, publish_ns, data = row
+    key = keys.parse(info.channel.topic)
+    topic = None if key is None else TOPICS.get(key.topic) or TOPICS.get(f"{key.car}/{key.topic}")
+    if key is None or topic is None or message_of(info) != topic.message:
+        return None
+    with suppress(DecodeError):
+        return Known(key, messages.message_class(topic.message).FromString(data), log_ns, publish_ns)
+    return None

@@ -8,8 +8,10 @@ from msgspec import Struct, field, to_builtins
 
 from fleet.client.diagnosis import DoctorFinding
 from fleet.recording.reading.mcap_reader import Row
-from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.stop_count import stops_cars
+from fleet.recording.tools.car_timeline import message_time_ns
+from fleet.recording.tools.moment import known_message
+from fleet.recording.tools.recorder_clock import RecorderClock
 from fleet.recording.tools.stop_findings import (
     NOT_SHOWN_CODE,
     NOT_STOPPED_CODE,
@@ -40,23 +42,23 @@ class SessionCheckup(Struct):
     """The only car to look at. Empty for all cars."""
     cars: set[str] = field(default_factory=set)
     """The cars of the session."""
-    _decoder: MessageDecoder = field(default_factory=MessageDecoder)
+    _clock: RecorderClock = field(default_factory=RecorderClock)
 
     def watch(self, rows: Iterable[Row]) -> Iterator[Row]:
         """Pass rows on, and count them."""
         for row in rows:
-            info, _, log_ns, _, data = row
-            key = keys.parse(info.channel.topic)
+            key = keys.parse(row[0].channel.topic)
             if key is not None and not key.car.startswith("@"):
                 self.cars.add(key.car)
             if key is not None and key.topic in WATCHED_TOPICS and self.car in ("", key.car):
-                message = self._decoder.message(info, data)
-                if message is not None:
-                    self.add(key.car, key.topic, message, log_ns)
+                known = known_message(row)
+                if known is not None:
+                    stamp_ns = message_time_ns(known.message, known.publish_ns)
+                    self.add(key.car, key.topic, known.message, self._clock.at_ns(key.car, stamp_ns, known.log_ns))
             yield row
 
-    def add(self, car: str, topic: str, message: Any, at_ns: int = 0) -> None:
-        """Count one message. `at_ns` is its time if it has no stamp."""
+    def add(self, car: str, topic: str, message: Any, at_ns: int) -> None:
+        """Count one message. `at_ns` is its time by the recorder's clock."""
         self.unshown.add(car, topic, message, at_ns)
         if topic == "event/log":
             self.broken[car] += log_code(message) == "link_lost"

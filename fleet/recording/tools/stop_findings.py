@@ -13,7 +13,6 @@ from msgspec import Struct, field
 
 from fleet.client.claims import claims_of
 from fleet.recording.stop_count import stops_cars
-from schemas import messages
 from schemas.keys import name_of
 from schemas.local_time import clock
 from schemas.words import UNKNOWN, LinkState, Phase, Reason, Shows
@@ -32,7 +31,7 @@ class UnshownStop(Struct):
 
     car: str
     at_ns: int
-    """The stamp of its record, by the clock of the car's gateway, ns since the epoch."""
+    """The time of its record, by the recorder's clock, ns since the epoch."""
     code: str
     asked: str
     """The verb and the sender, such as `stop by mia`. Empty if the gateway itself stopped the car."""
@@ -68,16 +67,15 @@ class StopFindings(Struct):
     _states: dict[str, dict[str, Any]] = field(default_factory=dict)
     """The newest states by car and topic."""
 
-    def add(self, car: str, topic: str, message: Any, at_ns: int = 0) -> None:
-        """Add a message of `WATCHED_TOPICS`. `at_ns` is its time if it has no stamp."""
+    def add(self, car: str, topic: str, message: Any, at_ns: int) -> None:
+        """Add a message of `WATCHED_TOPICS`. `at_ns` is its time by the recorder's clock."""
         if topic.startswith("state/"):
             self._states.setdefault(car, {})[topic] = message
         elif not (code := failed_stop_code(topic, message)):
             return
         elif topic == "event/log":
-            self._note(car, messages.stamp_ns(message.timestamp) or at_ns, code, "", message.message)
+            self._note(car, at_ns, code, "", message.message)
         else:
-            at_ns = messages.stamp_ns(message.stamp) or at_ns
             self._note(car, at_ns, code, asked_by(message), message.words or message.reason)
 
     def of(self, code: str) -> list[UnshownStop]:

@@ -256,9 +256,14 @@ def _state(session: Session, read: Session) -> tuple[SessionState, str]:
 
 def _recover(session: Session) -> str:
     """Return the command that repairs this session. It names the session, because the default is the newest one."""
+    return f"fleet sessions recover {typed_name(session)}"
+
+
+def typed_name(session: Session) -> str:
+    """Return what to type for a session: its name, or its path if the name alone does not find it."""
     found = find_session(session.name)
     is_named = found.exists() and found.samefile(session.path)
-    return f"fleet sessions recover {shlex.quote(session.name if is_named else str(session.path))}"
+    return shlex.quote(session.name if is_named else str(session.path))
 
 
 def _is_written_lately(session: Session) -> bool:

@@ -94,7 +94,7 @@ def read(path: Path) -> tuple[str, list[Item]]:
     try:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             objects.append((number, json.loads(line)))
-    except ValueError as error:  # UnicodeDecodeError is a ValueError
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError
         raise BadVector(f"{path}, line {len(objects) + 1}: this is not JSON in UTF-8: {error}") from None
     head = objects[0][1] if objects else None
     if not isinstance(head, dict) or not isinstance(head.get("format"), int) or not isinstance(head.get("car"), str):
@@ -107,7 +107,7 @@ def read(path: Path) -> tuple[str, list[Item]]:
     for number, each in objects[1:]:
         try:
             items.append(_item(each))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise BadVector(f"{path}, line {number}: {type(error).__name__}: {error}") from None
     return head["car"], items
 

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from fleet.commands.car_names import cars_argument
 from fleet.commands.params import Color, Duration, Number, session_argument
+from fleet.recording import session_dir
 from fleet.recording.session_lookup import newest_first
 from schemas.duration import format_duration, parse_duration
 
@@ -101,6 +102,7 @@ def test_newest_session_is_last_begun(place: Path) -> None:
         ("nothing", "nothing"),
         ("latest~4", "latest~4: there are only 4 recorded sessions in "),
         ("--sessions elsewhere", "No recordings here yet (in elsewhere)."),
+        ("--sessions copies", "All sessions in copies are made of others"),
     ],
 )
 def test_session_argument_is_newest_or_named(
@@ -112,6 +114,10 @@ def test_session_argument_is_newest_or_named(
         click.echo(session)
 
     monkeypatch.chdir(place.parent)
+    made = Path("copies") / "cut"
+    made.mkdir(parents=True)
+    (made / "0001.mcap").touch()
+    session_dir.SessionInfo("fleet", "", "", {}, origin={"by": "cut"}).write(made)
     result = CliRunner().invoke(show, arguments.split())
     assert words in result.output
 

@@ -56,12 +56,22 @@ def test_session_without_whole_part_is_refused_with_cause(tmp_path: Path) -> Non
 
 WRONG = [
     f'{{"fleet": "f", "started": "", "host": "", "versions": {{}}, {more}}}'
-    for more in ('"drops": 7', '"missed": {"a": "b"}', '"marks": [1]', '"ended": 5', '"origin": []', '"messages": "x"')
+    for more in (
+        '"drops": 7',
+        '"missed": {"a": "b"}',
+        '"marks": [1]',
+        '"marks": [{"time": 5}]',
+        '"pins": [{"from": [], "to": ""}]',
+        '"ended": 5',
+        '"origin": []',
+        '"messages": "x"',
+    )
 ]
+DEEP = "[" * 200_000
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "null", "7", '{"format": "2"}', '{"format": null}', "\0", '{"fleet": 1}', *WRONG]
+    "text", ["", "[]", "null", "7", '{"format": "2"}', '{"format": null}', "\0", '{"fleet": 1}', DEEP, *WRONG]
 )
 def test_description_that_cannot_be_read_hides_no_message(tmp_path: Path, text: str) -> None:
     (tmp_path / "0001.mcap").write_bytes(mcap(1))

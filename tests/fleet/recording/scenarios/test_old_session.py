@@ -5,11 +5,16 @@ expected texts are the output of that commit.
 """
 
 import hashlib
+import json
+import shlex
 from pathlib import Path
 
 import pytest
 import rerun.chunk as rrc
 
+from fleet.recording import session_dir
+from fleet.recording.reading.mcap_copy import McapCopy
+from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import Session
 from tests.support.in_process import fleet
 
@@ -37,6 +42,32 @@ def test_todays_decoder_and_policy_do_with_it_as_they_did(command: str, words: s
     done = fleet(*command.split(), SESSION)
     assert done.returncode == 0, done.stderr
     assert words in done.stdout
+
+
+def test_its_cars_are_explained() -> None:
+    """Its messages lack fields that the explanations read."""
+    done = fleet("why", "red", "--at", "6s", "--session", SESSION)
+    assert done.returncode == 0, done.stderr
+    assert "stop by root complete (shown)" in done.stdout
+
+
+def test_its_failed_stop_is_explained(tmp_path: Path) -> None:
+    """The stop of `green` is made a failed one. Its gateway's clock is 2 h behind the recorder's."""
+    decoder, count = MessageDecoder(), 0
+    with McapCopy(session_dir.segment(tmp_path, 1)) as copy:
+        for info, sequence, log_ns, publish_ns, payload in Session(SESSION).rows():
+            data, event = payload, decoder.message(info, payload)
+            if info.channel.topic == "fleet/green/event/command" and event.verb == "stop" and event.phase == "complete":
+                event.phase, event.reason, event.basis = "failed", "not_shown", ""
+                data = event.SerializeToString()
+            copy.add((info, sequence, log_ns + 7_200_000_000_000, publish_ns, data))
+            count += 1
+    session_dir.SessionInfo("fleet", "2026-11-22T15:18:29Z", "", {}, closed=True, messages=count).write(tmp_path)
+    (found,) = json.loads(fleet("doctor", tmp_path, "--json").stdout)["findings"]
+    assert found["code"] == "not_shown"
+    done = fleet(*shlex.split(found["todo"])[1:])
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("green at "), "it is at the time that `fleet doctor` names"
 
 
 def test_old_session_exports_same_tables(tmp_path: Path) -> None:

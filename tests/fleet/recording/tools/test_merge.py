@@ -2,17 +2,19 @@
 
 import random
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 from click.testing import CliRunner
 
 from fleet.cli import cli
-from fleet.recording import session_dir
+from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
-from fleet.recording.selection import EVERYTHING
+from fleet.recording.selection import EVERYTHING, Selection
 from fleet.recording.tools.merge_cut_recover import Exists, cut, merge
 from tests.fleet.replay.make_session import make
 
@@ -26,15 +28,22 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return Session(directory)
 
 
-def part_of(session: Session, out: Path, rows: list[Row]) -> Session:
-    """Write a session of some of its messages."""
+def part_of(
+    session: Session,
+    out: Path,
+    rows: list[Row],
+    drops: Mapping[str, int] = MappingProxyType({}),
+    missed: Mapping[str, int] = MappingProxyType({}),
+) -> Session:
+    """Write a session of some of its messages, with what its recorder has dropped and missed, by key."""
     out.mkdir()
     with McapCopy(session_dir.segment(out, 1)) as copy:
         for row in rows:
             copy.add(row)
     assert session.description is not None
-    info = session_dir.SessionInfo(session.description.fleet, session.description.started, "", {}, closed=True)
-    info.messages = len(rows)
+    first, last = (time_spec.iso(rows[at][2]) for at in (0, -1))
+    info = session_dir.SessionInfo(session.description.fleet, first, "", {}, ended=last, closed=True)
+    info.messages, info.drops, info.missed = len(rows), dict(drops), dict(missed)
     info.marks = [{"time": session.description.started, "text": out.name, "by": "ann"}]
     info.write(out)
     return Session(out)
@@ -78,6 +87,62 @@ def test_merge_names_what_damaged_session_lost(whole: Session, tmp_path: Path) -
     made = Session(tmp_path / "out").description
     assert made is not None
     assert "one: " in made.origin["lost"]
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+@pytest.mark.parametrize(
+    ("has", "drops", "missed"),
+    [("all", 0, 0), ("the lost ones too late", 1, 2), ("half of the time", 1, 2), ("one of the lost ones", 0, 2)],
+)
+def test_losses_remain_only_if_no_recorder_has_the_messages(
+    has: str, drops: int, missed: int, order: tuple[int, int], whole: Session, tmp_path: Path
+) -> None:
+    """One recorder dropped the first of three messages, and missed the others."""
+    rows = sorted(whole.rows(), key=lambda row: row[2])
+    key = rows[len(rows) // 4][0].channel.topic
+    lost = [row for row in rows if row[0].channel.topic == key][-4:-1]
+    end_ns = rows[-1][2]
+    late = [(info, number, log_ns + end_ns, publish_ns, data) for info, number, log_ns, publish_ns, data in rows]
+    others = {
+        "all": rows,
+        "the lost ones too late": late,
+        "half of the time": rows[: len(rows) // 2],
+        "one of the lost ones": [row for row in rows if row not in lost[1:]],
+    }
+    parts = [
+        part_of(whole, tmp_path / "a", [row for row in rows if row not in lost], drops={key: 1}, missed={key: 2}),
+        part_of(whole, tmp_path / "b", others[has]),
+    ]
+    merge([parts[at] for at in order], tmp_path / "out")
+    made = Session(tmp_path / "out").description
+    assert made is not None
+    assert (made.drops.get(key, 0), made.missed.get(key, 0)) == (drops, missed)
+
+
+def test_losses_of_two_recorders_of_one_time_count_once(whole: Session, tmp_path: Path) -> None:
+    rows = sorted(whole.rows(), key=lambda row: row[2])
+    key = rows[len(rows) // 4][0].channel.topic
+    lost = [row for row in rows if row[0].channel.topic == key][-3:-1]
+    there = [row for row in rows if row not in lost]
+    day_ns = 86_400_000_000_000
+    later = [(info, number, log_ns + day_ns, publish_ns, data) for info, number, log_ns, publish_ns, data in there]
+    both = [part_of(whole, tmp_path / name, there, missed={key: 2}) for name in ("a", "b")]
+    third = part_of(whole, tmp_path / "c", later, missed={key: 2})
+    merge(both, tmp_path / "two")
+    merge([*both, third], tmp_path / "three")
+    found = [Session(tmp_path / name).description for name in ("two", "three")]
+    assert [each and each.missed for each in found] == [{key: 2}, {key: 4}]
+
+
+def test_part_has_only_losses_that_may_be_in_it(whole: Session, tmp_path: Path) -> None:
+    rows = sorted(whole.rows(), key=lambda row: row[2])
+    counts = {"fleet/red/sensor/line": 2, "fleet/green/sensor/line": 3}
+    lossy = part_of(whole, tmp_path / "a", rows, missed=counts, drops=counts)
+    cut(lossy, tmp_path / "time", Selection(None, rows[1][2], None))
+    cut(lossy, tmp_path / "car", EVERYTHING, ["red"])
+    found = [session_dir.SessionInfo.read(tmp_path / name) for name in ("time", "car")]
+    of_red = {"fleet/red/sensor/line": 2}
+    assert [each and (each.missed, each.drops) for each in found] == [({}, {}), (of_red, of_red)]
 
 
 def test_sessions_of_two_fleets_are_refused(whole: Session, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def event(**fields: Any) -> pb.CommandEvent:
 def test_each_condition_has_its_finding(code: str, messages: list[Any], verdict: dict[str, Any]) -> None:
     checkup = SessionCheckup()
     for message in messages:
-        checkup.add("red", "event/log" if isinstance(message, Log) else "event/command", message)
+        checkup.add("red", "event/log" if isinstance(message, Log) else "event/command", message, 0)
     found = list(checkup.findings(SessionVerdict("sessions/a", **verdict), "a"))
     assert [each.code for each in found] == [code]
     assert found[0].todo.startswith("fleet ")
@@ -53,7 +53,7 @@ def test_stops_are_counted_by_what_they_rest_on() -> None:
         {"verb": "stop", "phase": "failed", "reason": "not_shown"},
         {"verb": "drive", "phase": "complete", "basis": ""},
     ):
-        checkup.add("red", "event/command", event(**fields))
+        checkup.add("red", "event/command", event(**fields), 0)
     facts = dict(checkup.facts(SessionVerdict("a", messages=5, clocks={"red": Clock(0, 0, backwards=2)})))
     assert facts["stops"] == "1 shown, 1 sent, 1 failed"
     assert facts["clock steps"] == "2"

@@ -4,13 +4,14 @@ from collections.abc import Iterator
 
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
-from google.protobuf.timestamp_pb2 import Timestamp
 
+from fleet.recording.tools.recorder_clock import WINDOW_NS, RecorderClock
 from fleet.recording.tools.stop_findings import StopFindings
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.zones import zone
 
-NOON = 1_795_608_000  # 2026-11-25 12:00 UTC
+SECOND_NS = 1_000_000_000
+NOON_NS = 1_795_608_000 * SECOND_NS  # 2026-11-25 12:00 UTC
 NOT_REACTED = "NOT CONFIRMED: red has not reacted to the stop yet. Look at the car. The gateway keeps stopping it."
 
 
@@ -20,23 +21,25 @@ def _in_berlin() -> Iterator[None]:
         yield
 
 
-def failed(at_s: int, verb: str = "stop", reason: str = "not_shown", words: str = NOT_REACTED) -> pb.CommandEvent:
-    return pb.CommandEvent(
-        car="red", verb=verb, sender="mia", phase="failed", reason=reason, words=words, stamp=Timestamp(seconds=at_s)
-    )
+def failed(verb: str = "stop", reason: str = "not_shown", words: str = NOT_REACTED) -> pb.CommandEvent:
+    return pb.CommandEvent(car="red", verb=verb, sender="mia", phase="failed", reason=reason, words=words)
 
 
-def logged(at_s: int, code: str, words: str = NOT_REACTED) -> Log:
-    return Log(name=f"red {code}", message=words, timestamp=Timestamp(seconds=at_s))
+def logged(code: str, words: str = NOT_REACTED) -> Log:
+    return Log(name=f"red {code}", message=words)
 
 
 def test_stop_finding_has_car_time_person_cause_once() -> None:
     found = StopFindings()
-    found.add("red", "state/link", pb.Link(state="lost", reason="unplugged"))
-    found.add("red", "state/health", pb.Health(shows_stops="yes", doubted=True, shows_stops_words="red is in doubt"))
-    found.add("red", "event/command", failed(NOON))
-    found.add("red", "event/log", logged(NOON + 1, "not_shown"))
-    found.add("red", "event/command", pb.CommandEvent(verb="drive", phase="failed", reason="link_down"))
+    health = pb.Health(shows_stops="yes", doubted=True, shows_stops_words="red is in doubt")
+    for at_s, topic, message in (
+        (0, "state/link", pb.Link(state="lost", reason="unplugged")),
+        (0, "state/health", health),
+        (0, "event/command", failed()),
+        (1, "event/log", logged("not_shown")),
+        (1, "event/command", pb.CommandEvent(verb="drive", phase="failed", reason="link_down")),
+    ):
+        found.add("red", topic, message, NOON_NS + at_s * SECOND_NS)
     (stop,) = found.stops
     assert (stop.car, stop.code, stop.asked) == ("red", "not_shown", "stop by mia")
     assert stop.cause == "its link was lost (unplugged), red is in doubt"
@@ -46,20 +49,23 @@ def test_stop_finding_has_car_time_person_cause_once() -> None:
 
 def test_log_alone_is_enough_and_not_stopped_weighs_more() -> None:
     found = StopFindings()
-    found.add(
-        "red", "event/log", logged(NOON, "not_stopped", "red may still be moving: red has not reacted to the stop.")
-    )
-    found.add("red", "event/command", failed(NOON, words="has not reacted to the stop"))
+    words = "red may still be moving: red has not reacted to the stop."
+    found.add("red", "event/log", logged("not_stopped", words), NOON_NS)
+    found.add("red", "event/command", failed(words="has not reacted to the stop"), NOON_NS)
     (stop,) = found.stops
     assert (stop.code, stop.asked, stop.cause) == ("not_stopped", "stop by mia", "")
 
 
 def test_two_stops_are_two() -> None:
     found = StopFindings()
-    found.add("red", "event/command", failed(NOON))
-    found.add("red", "event/command", failed(NOON + 60))
-    found.add("blue", "event/command", failed(NOON + 60))
-    found.add("red", "event/command", failed(NOON + 61, verb="estop", reason="link_down", words="red is unreachable"))
+    unreachable = failed(verb="estop", reason="link_down", words="red is unreachable")
+    for car, at_s, event in (
+        ("red", 0, failed()),
+        ("red", 60, failed()),
+        ("blue", 60, failed()),
+        ("red", 61, unreachable),
+    ):
+        found.add(car, "event/command", event, NOON_NS + at_s * SECOND_NS)
     assert [(each.car, each.code) for each in found.stops] == [
         ("red", "not_shown"),
         ("red", "not_shown"),
@@ -71,6 +77,29 @@ def test_two_stops_are_two() -> None:
 
 def test_stop_that_ended_as_sent_is_no_finding() -> None:
     found = StopFindings()
-    found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="sent", basis="sent"))
-    found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="complete", basis="shown"))
+    found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="sent", basis="sent"), NOON_NS)
+    found.add("red", "event/command", pb.CommandEvent(verb="stop", phase="complete", basis="shown"), NOON_NS)
     assert found.stops == []
+
+
+SHORT_NS = SECOND_NS // 100
+
+
+def test_stamps_of_a_wrong_clock_become_times_of_the_recorder() -> None:
+    recorder_clock, wrong_ns = RecorderClock(), 2 * 3600 * SECOND_NS
+    for second in range(100):
+        at_ns = NOON_NS + second * SECOND_NS
+        assert recorder_clock.at_ns("red", at_ns - wrong_ns, at_ns + SHORT_NS) == at_ns + SHORT_NS
+    # A backfilled message comes 20 s late, and is still of its own time.
+    late_ns = NOON_NS + 100 * SECOND_NS
+    assert recorder_clock.at_ns("red", late_ns - wrong_ns, late_ns + 20 * SECOND_NS) == late_ns + SHORT_NS
+    assert recorder_clock.at_ns("blue", late_ns, late_ns) == late_ns
+
+
+def test_step_of_the_recorders_clock_counts_after_two_windows() -> None:
+    recorder_clock, step_ns = RecorderClock(), 3600 * SECOND_NS
+    recorder_clock.at_ns("red", NOON_NS, NOON_NS)
+    for second in range(3 * WINDOW_NS // SECOND_NS):
+        at_ns = NOON_NS + second * SECOND_NS
+        found_ns = recorder_clock.at_ns("red", at_ns, at_ns + step_ns)
+    assert found_ns == at_ns + step_ns

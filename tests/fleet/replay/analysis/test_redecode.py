@@ -198,6 +198,8 @@ def test_bad_input_is_told_in_a_line(tmp_path: Path) -> None:
         ('{"format": 1, "car": "red"}\n{"at_us": 1, "mode": "asleep"}\n', "line 2: ValueError"),
         ('{"format": 1, "car": "red"}\n{"at_us": 1, "rx": "$"}\n', "line 2: KeyError"),
         ('{"format": 1, "car": "red"}\n7\n', "line 2: TypeError"),
+        ('{"format": 1, "car": "red"}\n{"at_us": 1e999, "tx": "a"}\n', "line 2: OverflowError"),
+        ("[" * 200_000, "line 1: this is not JSON"),
     ):
         path = tmp_path / "bad.jsonl"
         path.write_text(text)
