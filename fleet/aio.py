@@ -81,7 +81,7 @@ class Fleet:
         self._threads.shutdown(wait=False)
 
     async def call(self, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
-        """Run a blocking call in a thread. If the task is cancelled, the call still runs to its end."""
+        """Run a blocking call in a thread. If the task is cancelled, a call that has begun still runs to its end."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(function, *args, **options))
 
     @property
@@ -114,7 +114,7 @@ class Fleet:
         """Subscribe to readings: `async for reading in fleet.watch("*/sensor/range")`.
 
         If the fleet stays open longer than you need the watch, use the watch with `async with`. Otherwise it receives
-        readings until the fleet is closed.
+        readings until the fleet is closed. Raises conditions.BadExpression.
         """
         key_expression = check_key(self.sync.expression(expression))
         watch = Watch(None if when is None else KeyCondition.of(when, key_expression).holds)
@@ -225,7 +225,10 @@ class Car(CarCommands[Coroutine[Any, Any, Outcome]]):
 
 
 class Lease:
-    """The lease of a car, from `Car.lease`. Use it with `async with`. Raises LeaseLost if another client has it."""
+    """The lease of a car, from `Car.lease`. Use it with `async with`.
+
+    Raises NotCarriedOut if the car cannot be reserved, and LeaseLost (a NotCarriedOut) if another client has it.
+    """
 
     def __init__(self, fleet: Fleet, name: str, *, take: bool) -> None:
         self._fleet = fleet

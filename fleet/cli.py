@@ -48,7 +48,7 @@ COMMANDS: Final = {
             "List the cars: link, mode, motion, who is in control, battery.",
         ),
         "console": ("fleet.commands.console:console", "Serve the fleet as a web page: watch, drive, STOP."),
-        "status": ("fleet.commands.lifecycle:status", "Show processes, session and hub at a glance."),
+        "status": ("fleet.commands.lifecycle:status", "Show the fleet, its session and cars, and what is not ready."),
         "doctor": ("fleet.commands.doctor:doctor", "Tell why a car or a session is odd, and what to type."),
         "reload": ("fleet.commands.lifecycle:reload", "Apply changes in fleet.yaml without a restart."),
         "logs": ("fleet.commands.lifecycle:logs", "Show what a car's gateway or a service has logged."),
@@ -83,7 +83,7 @@ COMMANDS: Final = {
         ),
         "estop": (
             "fleet.commands.drive:estop",
-            "Emergency stop: cars refuse everything until `resume --estops`.",
+            "Emergency stop: cars refuse everything but stops until `resume --estops`.",
         ),
         "resume": ("fleet.commands.drive:resume", "Let the plan use stopped cars again."),
         "pause": ("fleet.commands.people:pause", "Stop all cars. Only a lead moves a car until `unpause`."),
@@ -106,7 +106,7 @@ COMMANDS: Final = {
         "wait": ("fleet.commands.observe:wait", "Wait until a condition is true."),
         "keys": (
             "fleet.commands.observe:list_keys",
-            "List everything that is published now, with rate and age.",
+            "List what cars, plan and recorder publish now, with rate and age.",
         ),
     },
     "Plans": {

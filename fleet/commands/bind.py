@@ -48,7 +48,7 @@ A TCP car does not need this command: write its address into the file."""
 @file_argument
 @link_option
 @listen_option
-@connect_option("The bus (default: the file's, FLEET_ENDPOINT, or port 7447).")
+@connect_option("The bus (default: the file's, FLEET_ENDPOINT, the hub you joined, or port 7447 here).")
 def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str | None) -> None:
     """Find out which car is which: each car blinks and beeps, you type its name, and the file gets the car's link."""
     with cli_errors():

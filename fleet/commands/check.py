@@ -59,15 +59,16 @@ examples:
   fleet check plan.yaml
   fleet check fleet.yaml plan.yaml world.yaml --json
 
-Exit codes: 0 no mistakes, 1 a car's port is missing or a part of a plan can never work, 2 a file is wrong."""
+Exit codes: 0 no mistakes, 1 a car cannot be reached or a part of a plan can never work, 2 a file is wrong."""
 )
 @click.argument("files", nargs=-1, metavar="[FILE...]", type=click.Path(path_type=Path, dir_okay=False))
 @json_option
 def check(files: tuple[Path, ...], *, as_json: bool) -> None:
     """Check fleet files, plans and worlds (default: fleet.yaml), and whether each car's port exists and is free.
 
-    The command does not touch the cars. If a fleet file names a plan or a world, the command checks it for the cars of
-    that fleet. It warns if a Bluetooth adapter has more cars than the adapter can connect at once.
+    For a car on TCP, it checks whether the host is there. The command does not touch the cars. If a fleet file names a
+    plan or a world, the command checks it for the cars of that fleet. It warns if a Bluetooth adapter has more cars
+    than the adapter can connect at once.
     """
     checks = _Checks(as_json=as_json)
     kinds = {file: checks.recognize(file) for file in files or (DEFAULT_FILE,)}

@@ -54,7 +54,7 @@ _PROBE_TIMEOUT_S: Final = 1.0
 
 
 def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
-    """Refuse every address but loopback."""
+    """Refuse every address but loopback. The page is at 127.0.0.1 whatever the address."""
     try:
         is_loopback = host in _LOOPBACK_NAMES or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -121,7 +121,7 @@ examples:
     show_default=True,
     callback=_check_host,
     expose_value=False,
-    help="Serve at this address. Only loopback is allowed.",
+    help="Without effect: the page is always at 127.0.0.1. An address other than loopback is refused.",
 )
 @click.option("--lan", "on_lan", is_flag=True, help="Also serve paired devices on the network, over HTTPS.")
 @click.option(
@@ -135,7 +135,7 @@ examples:
     "--sessions",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Show the sessions in DIR (default: as in the fleet file, or sessions).",
+    help="Show the sessions in DIR (default: sessions, or if there is none here, as in the fleet file here).",
 )
 @click.option(
     "--fleet-file",

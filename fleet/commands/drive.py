@@ -97,9 +97,10 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 @json_option
 @bus_options
 def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Stop these cars now, or all cars if you name none. A running plan leaves them alone until you drive or resume.
+    """Stop these cars now, or all cars if you name none.
 
-    Without --fleet, this reaches all fleets on the bus. `fleet estop` also makes cars refuse every command.
+    A running plan leaves them alone until you drive them, give them a mode, or resume them. Without --fleet, this
+    reaches all fleets on the bus. `fleet estop` also makes cars refuse every command but stops.
     `fleet mode CAR manual` stops a car without a hold, so a plan may use it at once.
     """
     _stop(connect, fleet, cars, lambda _: stop_request(), as_json=as_json)
@@ -111,7 +112,7 @@ def stop(cars: tuple[str, ...], connect: str | None, fleet: str, *, as_json: boo
 @json_option
 @bus_options
 def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, as_json: bool) -> None:
-    """Emergency stop: these cars, or the whole fleet, stop and refuse every command.
+    """Emergency stop: these cars, or the whole fleet, stop and refuse every command but stops.
 
     Without --fleet, this reaches all fleets on the bus. `fleet resume --estops` releases the cars. For
     everyday use there is `fleet stop`: after it, cars obey again at once.

@@ -30,7 +30,7 @@ def carry_out(
 
 
 def end_with(client: Fleet, outcomes: Sequence[Outcome], *, as_json: bool) -> Never:
-    """Print each outcome. Exit with code 0 if all cars have carried out the command, 2 for a bad value, 1 otherwise.
+    """Print each outcome. Exit with code 0 if all cars have obeyed, 2 if every failure is a bad value, 1 otherwise.
 
     Fail if there is no outcome, which means that no car is connected.
     """

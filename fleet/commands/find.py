@@ -70,7 +70,7 @@ def find(
     as_csv: bool,
     as_json: bool,
 ) -> None:
-    """Find when CONDITION held, in every session in DIR (default: sessions).
+    """Find when CONDITION held, in every session in DIR (default: sessions, else as in the fleet file here).
 
     CONDITION is written as in plans: range_m < 0.3, with and, or, not. A value that was not measured, or is stale, is
     unknown. A hit lasts from the first reading for which CONDITION is true to the last one. A session that

@@ -98,7 +98,7 @@ examples:
     metavar="N",
     help="Write N simulated cars and plan.yaml. Do not look for cars.",
 )
-@click.option("-y", "--yes", is_flag=True, help="Accept every detected car without asking.")
+@click.option("-y", "--yes", is_flag=True, help="Accept every likely car without asking.")
 @click.option("--force", is_flag=True, help="Overwrite an existing file.")
 @click.option(
     "-o",

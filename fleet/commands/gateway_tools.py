@@ -23,7 +23,7 @@ when a connection to it ends."""
 @click.option("--probe", is_flag=True, help="Send a stop to cars and to silent ports. Every car that is found stops.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
 def scan(links: tuple[str, ...], listen: str | None, *, probe: bool, as_json: bool) -> None:
-    """Look for cars on Bluetooth and serial ports. The scan only listens, so no car moves."""
+    """Look for cars on Bluetooth and serial ports. Without --probe, it only listens. No scan makes a car move."""
     words = [word for link in links for word in ("--link", link)]
     if listen is not None:
         words += ["--for", listen]

@@ -292,7 +292,10 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
 
 @click.command(epilog="\b\nexample:\n  fleet leave")
 def leave() -> None:
-    """Leave the hub that this computer has joined. The certificate on this computer is deleted."""
+    """Leave the hub that this computer has joined. The certificate on this computer is deleted.
+
+    On the hub's own computer, its authority and certificates stay, and only the use of the hub ends.
+    """
     with cli_errors(), _disk_errors():
         if cars := running_cars(resolve_endpoint()):
             raise click.ClickException(

@@ -45,7 +45,7 @@ LOG_POLL_S: Final = 0.2
 @json_option
 @bus_options
 def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -> None:
-    """Show the fleet and its session, then the cars, then the services that do not run as they should."""
+    """Show the fleet and its session, then the cars, then which cars and services are not ready, and why."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         fleet = the_fleet(bus, fleet)
@@ -154,7 +154,8 @@ def _until_ended(bus: Bus, fleet: str, received: list[Any]) -> tuple[Any, bool]:
 example:
   fleet reload
 
-Exit codes: 0 every change is in force, 1 some need a restart of the fleet, 2 the file is wrong and nothing changed."""
+Exit codes: 0 every change is in force, 1 some need a restart, or no fleet runs, 2 nothing changed, such as with a wrong
+file."""
 )
 @json_option
 @bus_options
@@ -195,7 +196,7 @@ def _names_of_logs(directory: Path) -> list[str]:
 def logs(name: str, connect: str | None, fleet: str, *, follow: bool, as_json: bool) -> None:
     """Show the log of a car's gateway or of a service, from the current or the last run.
 
-    Services: supervisor, hub, simulator, coordinator, recorder.
+    Services: supervisor, hub, simulator, coordinator, recorder, console. One that has logged nothing has no log.
     """
     directory = _log_directory(connect, keys.check_name(fleet, "fleet name"))
     candidates = [directory / f"{prefix}{name}.log" for prefix in ("", "@")]

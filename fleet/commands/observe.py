@@ -332,7 +332,7 @@ def watch(keyexpr: str, *, when: str | None, count: int | None, as_json: bool, c
 @json_option
 @bus_options
 def list_keys(keyexpr: str | None, *, look_s: float, as_json: bool, connect: str | None, fleet: str) -> None:
-    """List everything that is published now: message type, units, rate, and age of the newest value.
+    """List what the cars, the plan and the recorder publish now: message type, units, rate, age of the newest value.
 
     A rate is "-" if fewer than two messages came during the measurement. An age is "-" if no message came.
     """

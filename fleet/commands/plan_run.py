@@ -66,7 +66,10 @@ def run(
     starter: int | None,
     as_json: bool,
 ) -> None:
-    """Run a plan until Ctrl-C, and print one line per decision. The plan leaves alone what you have stopped."""
+    """Run a plan until Ctrl-C, and print one line per decision. The plan leaves alone what you have stopped.
+
+    At the end, the cars keep their modes, so they may go on moving. `fleet plan stop` brings them to rest first.
+    """
     parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
     file = None if fleet_file is None else read_fleet(fleet_file, unbound=True)

@@ -24,7 +24,8 @@ examples:
   fleet query "SELECT session, car, min(range_m) FROM sensor_range GROUP BY ALL"
   fleet query "SELECT car, mode, count(*) FROM sensor_line_context GROUP BY ALL" --csv > modes.csv
 
-Exit codes: 0 done, 1 sessions, but none of them could be read, or no disk has room for the tables, 2 wrong use."""
+Exit codes: 0 done, 1 there is no DIR, none of its sessions could be read, or no disk has room for the tables,
+2 wrong use."""
 )
 @click.argument("sql", required=False, metavar="[SQL]")
 @click.argument("directory", required=False, type=click.Path(path_type=Path), metavar="[DIR]")
@@ -32,12 +33,13 @@ Exit codes: 0 done, 1 sessions, but none of them could be read, or no disk has r
 @click.option("--csv", "as_csv", is_flag=True, help="Write CSV.")
 @json_option
 def query(sql: str | None, directory: Path | None, *, tables: bool, as_csv: bool, as_json: bool) -> None:
-    """Answer an SQL question about all sessions in DIR (default: sessions). With - for SQL, read it from stdin.
+    """Answer an SQL question about all sessions in DIR (default: sessions, else as in the fleet file here).
 
-    SQL is the dialect of DuckDB. Each topic is a table, such as sensor_range or event_command, with the columns of
-    `fleet sessions export` and the column session. Tables named ..._context add the mode, motion, driver and plan at
-    that time. Times are UTC. The sender of a command is a process (tom@host-4711): person_of(sender) is the person.
-    Sessions that are not whole are listed, and only their intact part is used.
+    With - for SQL, the command reads it from stdin. SQL is the dialect of DuckDB. Each topic is a table, such as
+    sensor_range or event_command, with the columns of `fleet sessions export` and the column session. Tables named
+    ..._context add the mode, motion, driver and plan at that time. Times are UTC. The sender of a command is a process
+    (tom@host-4711): person_of(sender) is the person. Sessions that are not whole are listed, and only their intact part
+    is used.
     """
     from fleet.recording.catalog import BadQuery, Catalog, QueryFailed
     from fleet.recording.tools.table_formats import FormatMissing

@@ -1,6 +1,7 @@
 """`fleet sessions`: lists, verifies, recovers, cuts and exports recordings."""
 
 import json
+import shlex
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -96,9 +97,9 @@ def _open(path: Path) -> "Session":
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     """List the sessions in DIR: start, state, length, size, lost messages, stops, marks and cars.
 
-    By default, DIR is that of the fleet file here, or `sessions`. A stop of several cars counts once, whoever asked for
-    it. The list also shows damaged sessions, and what is damaged, as far as their indexes tell. Only
-    `fleet sessions verify` finds all damage.
+    By default, DIR is `sessions`, or if there is none here, that of the fleet file here. A stop of several cars counts
+    once, whoever asked for it. The list also shows damaged sessions, and what is damaged, as far as their indexes tell.
+    Only `fleet sessions verify` finds all damage.
     """
     _show(_summaries(directory), as_json=as_json)
     if not as_json:
@@ -130,9 +131,13 @@ def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     if not ran:
-        raise click.ClickException(f"No session ran at {time_text}. `fleet sessions` lists all, with their start.")
+        place = "" if directory is None else f" {shlex.quote(str(directory))}"
+        raise click.ClickException(
+            f"No session ran at {time_text}. `fleet sessions{place}` lists all, with their start."
+        )
     _show(ran, as_json=as_json)
-    click.echo(f"Open one at that time: `fleet replay {ran[-1].name} --from '{time_text}'`", err=True)
+    session = ran[-1].name if directory is None else shlex.quote(ran[-1].path)
+    click.echo(f"Open one at that time: `fleet replay {session} --from '{time_text}'`", err=True)
 
 
 def _summaries(directory: Path | None) -> list["SessionSummary"]:

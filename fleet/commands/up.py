@@ -51,8 +51,8 @@ Without FILE and --sim, the file is ./fleet.yaml. The start ends with one line: 
 missing and why. With --sim and --json, lines on stdin go to the simulator (`gateway sim --help`). If a car cannot be
 stopped at the end, new gateways try again to stop it until the next Ctrl-C.
 
-With --detach the command returns when all cars are ready. It also returns if no further car becomes ready for 30 s
-(10 s if only cars whose links cannot be opened are missing). In both cases the fleet keeps running:
+With --detach the command returns when all cars and services are ready. It also returns if none of them becomes ready
+for 30 s (10 s if only cars whose links cannot be opened are missing). In both cases the fleet keeps running:
 `fleet logs supervisor` shows its log, `fleet down` ends it.
 
 Exit codes: 0 every car was stopped (with --detach: all are ready), 1 a car was not, or nothing started, or not
@@ -84,9 +84,13 @@ everything was recorded, 2 wrong use."""
 @click.option("--console", is_flag=True, help="Also serve the fleet as a web page on this computer.")
 @click.option("--console-port", type=Number(int, 1, 65535), help="Serve the web page at this port (default: 7480).")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object for each event.")
-@connect_option("The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, or port 7447).")
+@connect_option("The bus, tcp/HOST:PORT (default: the file's, FLEET_ENDPOINT, the hub you joined, or port 7447 here).")
 @fleet_option(default=None)
-@click.option("--insecure-lan", is_flag=True, help="Open the bus to a network. Everyone there can drive the cars.")
+@click.option(
+    "--insecure-lan",
+    is_flag=True,
+    help="Let the bus of --connect be open to a network. Everyone there can drive the cars.",
+)
 @click.option("--secure", is_flag=True, help="Use certificates, so that no other user of this computer can connect.")
 @click.option("--detach", is_flag=True, help="Return when the cars are ready. The fleet runs until `fleet down`.")
 @click.option("--detached", is_flag=True, hidden=True, help="Run as the process that --detach has started.")

@@ -17,4 +17,4 @@ codes), `rights_in_words` (who may do what), `waiting_room` (who may begin TLS),
 from typing import Final
 
 DEFAULT_PORT: Final = 7480
-"""A port near that of the bus (7447). Fleets with other names use the ports in between."""
+"""A port near that of the bus (7447)."""

@@ -16,7 +16,8 @@ log = logging.getLogger("fleet")
 def message_in(sample: Sample, level: int = logging.DEBUG) -> tuple[keys.Key, Any] | None:
     """Return the key and the message.
 
-    Return None, and log why at this level, if the type of the message does not fit its key.
+    Return None for a key that is not ours. Return None, and log why at this level, if no car has such a name, if the
+    type of the message does not fit its key, or if a number in it is not finite.
     """
     topic, key = topics.of_key(sample.key), keys.parse(sample.key)
     if topic is None or key is None:

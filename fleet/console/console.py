@@ -621,7 +621,7 @@ class Console:
         page.answer(t="over", press=press.id, words=words)
 
     async def close(self) -> None:
-        """Stop the cars that pages drive, and wait for their outcomes."""
+        """Stop the cars that pages drive, and wait for their outcomes, for at most 3 s."""
         for press in self._presses.alive:
             self._pages[press.client].operator.end_press(press)
         await self._operators.close()

@@ -31,7 +31,7 @@ class GuessLimit(Struct):
     """Counts wrong codes, and delays further tries from the addresses that sent them. Times are monotonic."""
 
     wrong: int = 0
-    """Number of all wrong codes."""
+    """Number of all wrong codes, and of all tries that came before the end of a wait."""
     _guessers: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Number of wrong codes and time of the last one, by address."""
 

@@ -216,7 +216,7 @@ class ConsoleOperator:
         return task
 
     async def close(self) -> None:
-        """Wait for the commands that have no outcome yet."""
+        """Wait for the commands that have no outcome yet, for at most 3 s."""
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=3.0)
 

@@ -70,7 +70,7 @@ class Operators:
                 self.own.spawn(self._close_idle(person, member))
 
     async def close(self) -> None:
-        """Wait for the commands that have no outcome yet, and close the clients."""
+        """Wait for the commands that have no outcome yet, for at most 3 s, and close the clients."""
         members = list(self._members.values())
         self._members.clear()
         await asyncio.gather(self.own.close(), *(_close(member) for member in members))

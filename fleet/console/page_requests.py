@@ -44,7 +44,10 @@ class PageMessage(Struct, frozen=True):
 
     @property
     def is_command(self) -> bool:
-        """True if the message is a command to gateways that counts against a budget. Stops and presses do not count."""
+        """True if the message is a command to gateways that counts against a budget.
+
+        Stops do not count. A press counts, too, but its own handler counts it.
+        """
         is_done = self.kind == "do" and self.fields.get("verb") not in STOPS
         return is_done or self.kind in ("take", "give_back", Verb.UNPAUSE)
 

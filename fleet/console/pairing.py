@@ -116,5 +116,6 @@ def show_code(address: str, code: str, person: PagePerson, write: Callable[[str]
         picture = io.StringIO()
         segno.make(pairing_link(address, code)).terminal(picture, compact=True, border=2)
         write(picture.getvalue())
-    write(f"To pair a device as {person.name}, scan, or open {address} and type {code_words(code)}")
+    how = "scan, or open" if draws else "open"
+    write(f"To pair a device as {person.name}, {how} {address} and type {code_words(code)}")
     write("The code works once, for 2 minutes. For another code, type: fleet console pair NAME")

@@ -1,7 +1,7 @@
 """Requests of the pages for the past: the lanes of a recording, and the state of everything at a moment of a recording.
 
-Anyone who may see the page may look back. Two processes read the recordings (past_worker.py), one for lanes and one for
-moments. The lanes of an hour take seconds, and a jump to a moment must not wait for them.
+Every person who may see the page may look back, a guest may not. Two processes read the recordings (past_worker.py),
+one for lanes and one for moments. The lanes of an hour take seconds, and a jump to a moment must not wait for them.
 """
 
 import asyncio

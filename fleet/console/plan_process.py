@@ -60,7 +60,7 @@ class PlanProcess:
         return (sys.executable, "-m", "fleet.cli", "plan", "run", str(plan), *listed, *where)
 
     async def close(self) -> None:
-        """End the coordinator. Before it ends, it sets its cars to mode manual."""
+        """End the coordinator. The cars keep their modes, so they may go on moving."""
         process, self._process = self._process, None
         if process is None or process.returncode is not None:
             return

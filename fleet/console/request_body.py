@@ -28,6 +28,6 @@ async def read_start(request: Request, size: int) -> bytes:
 
 
 async def read_text(request: Request, max_bytes: int) -> str | None:
-    """Return the body of a request. None if it is too large."""
+    """Return the body of a request. None if it is too large. Raises HTTPException if it does not come."""
     body = await read_start(request, max_bytes + 1)
     return None if len(body) > max_bytes else body.decode("utf-8", "replace")

@@ -31,7 +31,8 @@ _HEADERS: Final = (
 COOKIE_PATHS: Final = ("/", "/hello")
 """Where a page gets its cookie. `/hello` renews it after a restart of the console."""
 STOP_PATH: Final = "/stop"
-"""The only POST that needs no cookie: an old cookie must not make a stop fail. Host and Origin are checked."""
+"""A POST that needs no cookie on this computer, and from the network no valid one: that of an expired pairing will do.
+An old cookie must not make a stop fail. Host and Origin are checked."""
 
 PERSON: Final = "fleet.person"
 """Where the scope of a request from the network has its `PagePerson`."""
@@ -46,7 +47,7 @@ _HTTPS_PORT: Final = 443
 class Guard:
     """Passes requests of our own pages to the app, and refuses all others.
 
-    hosts: the allowed values of Host, as `127.0.0.1:7448`. token: the value of the cookie. `on_refusal` is called with
+    hosts: the allowed values of Host, as `127.0.0.1:7480`. token: the value of the cookie. `on_refusal` is called with
     words for the log.
     """
 
@@ -108,7 +109,7 @@ class NetworkGuard(Guard):
     """The filter for the network: only paired devices pass. Any other device can read only the page on which it pairs.
 
     `names` returns the host names of this computer. `device_of` returns the device of a cookie, and what the cookie
-    may do. `on_device` is called with the address of each connection that has shown a cookie.
+    may do. `on_device` is called for each request that passes with a cookie, with its address and its device.
     """
 
     def __init__(

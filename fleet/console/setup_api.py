@@ -1,6 +1,7 @@
 """Answers the requests of pages that set up a fleet: scan, make a car blink, write its link into the fleet file.
 
-Only pages on this computer may set up a fleet. In an existing file, only the links are changed.
+Only pages on this computer may set up a fleet. In an existing file, links are changed and new cars are added, and
+nothing else changes.
 """
 
 import asyncio

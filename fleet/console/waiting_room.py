@@ -34,7 +34,7 @@ a process."""
 HELLO_TIMEOUT_S: Final = 10.0
 """Timeout of a connection that sends nothing: the same as for a stranger (`connection_limit`)."""
 MAX_ADDRESSES: Final = 1024
-"""Maximum number of remembered addresses without a connection. Beyond it, an idle address is forgotten."""
+"""Maximum number of remembered addresses. Beyond it, an address without a connection is forgotten."""
 
 
 class _AddressLine(Struct):

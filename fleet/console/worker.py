@@ -51,9 +51,9 @@ class Worker:
         return self._open[person] >= self._max_open
 
     async def ask(self, question: Any, person: Hashable) -> dict[str, Any] | None:
-        """Return the answer to a question (JSON values), or None if it does not come in time.
+        """Return the answer to a question (JSON values). Raises TooManyQuestions.
 
-        Raises TooManyQuestions.
+        Return None if no answer comes in time, or if the process dies of the question twice.
         """
         if self.is_busy(person):
             raise TooManyQuestions
