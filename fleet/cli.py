@@ -199,7 +199,7 @@ class _LazyGroup(CommandGroup):
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="""`fleet COMMAND --help` shows examples.
 
-Exit codes: 0 carried out, 1 not carried out, 2 wrong use, 130 Ctrl-C.""",
+Exit codes: 0 carried out, 1 not carried out, 2 wrong use, 130 Ctrl-C (0 for services such as `up`).""",
 )
 @click.version_option(
     package_name="zenoh-car-fleet", prog_name="fleet", message="%(prog)s %(version)s", help="Show the version."

@@ -58,8 +58,8 @@ def bind(file: Path, links: tuple[str, ...], seconds: float | None, connect: str
     found = [each for each in look_for(links, seconds) if each.verdict != LinkVerdict.BUSY and _is_unknown(each, fleet)]
     if not found:
         raise click.ClickException(
-            f"No new car found: all cars that answered are in {file} already. Is the new car switched on? "
-            "`fleet scan` shows every link."
+            f"No new car found. Links in {file}, ports in use and cars on TCP are left out. "
+            "Is the new car switched on? `fleet scan` shows every link."
         )
     with (
         cli_errors(),
