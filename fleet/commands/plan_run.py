@@ -68,7 +68,7 @@ def run(
 ) -> None:
     """Run a plan until Ctrl-C, and print one line per decision. The plan leaves alone what you have stopped.
 
-    At the end, the cars keep their modes, so they may go on moving. `fleet plan stop` brings them to rest first.
+    Ctrl-C brings the cars of the plan to rest, and waits for that, at most until the next Ctrl-C.
     """
     parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
@@ -78,9 +78,12 @@ def run(
     found.raise_errors(str(path))
     for each in found.warnings:
         click.echo(each.at(str(path)), err=True)
-    stop = threading.Event()
+    stop, hurry = threading.Event(), threading.Event()
 
-    signals.calls(stop.set)
+    def end() -> None:
+        (hurry if stop.is_set() else stop).set()
+
+    signals.calls(end)
 
     def on_decided(decision: Decision) -> None:
         click.echo(_json(decision) if as_json else decision_line(decision))
@@ -102,7 +105,7 @@ def run(
                 listed,
                 None if file is None else people_table(file.people),
                 run_name,
-            ).run(lambda: stop.is_set() or has_ended(parent))
+            ).run(lambda: stop.is_set() or has_ended(parent), hurry.is_set)
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
 

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Final
 
 from fleet.aio import Fleet
+from schemas.limits import SHUTDOWN_S
 from schemas.process.children import kill
 from schemas.process.parent import parent_option
 
 _START_S: Final = 20.0
 """Timeout for the start of a coordinator. It starts in 1 s, on a busy machine in 10 s."""
-_END_S: Final = 5.0
+_END_S: Final = SHUTDOWN_S + 3.0
+"""Timeout for the end of a coordinator, which first brings its cars to rest."""
 _COORDINATOR_POLL_S: Final = 0.1
 
 
@@ -60,7 +62,7 @@ class PlanProcess:
         return (sys.executable, "-m", "fleet.cli", "plan", "run", str(plan), *listed, *where)
 
     async def close(self) -> None:
-        """End the coordinator. The cars keep their modes, so they may go on moving."""
+        """End the coordinator, which brings its cars to rest first."""
         process, self._process = self._process, None
         if process is None or process.returncode is not None:
             return

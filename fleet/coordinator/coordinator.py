@@ -3,11 +3,14 @@
 policy/ makes all decisions. One of them is to send nothing to a car on hold. The gateway enforces the hold, too.
 """
 
+import sys
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Final
+from math import inf
+from typing import Final, TypeVar
 
 import zenoh
 from msgspec.structs import replace
@@ -16,21 +19,22 @@ from fleet.client.client import Fleet
 from fleet.coordinator.inbox import Inbox, Item, QueriedSample
 from fleet.coordinator.observer import FleetObserver
 from fleet.coordinator.open_commands import OpenCommands
-from fleet.coordinator.other_coordinators import declare_alone, yield_to_another
+from fleet.coordinator.other_coordinators import SENDER, AnotherCoordinator, declare_alone, yield_to_another
 from fleet.coordinator.plan_query_parser import PLAN_VERB, bad_value, plan_command, rejected, reply_result, sender_of
 from fleet.coordinator.plan_state_file import CoordinatorStateFile
 from fleet.coordinator.publications import Publications, assignment_message, decision_message, in_force
 from fleet.policy.decide import step
-from fleet.policy.decision import Decision
+from fleet.policy.decision import Decision, DecisionKind
 from fleet.policy.lint.lint import find_faults
 from fleet.policy.plan.plan import Plan
 from fleet.policy.plan.plan_parser import parse
 from fleet.policy.plan_requests import EVENTS, PlanRequest, RequestRefused, check_sender, on_request
-from fleet.policy.snapshot import CarSnapshot, Refusal, topic_of
+from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, Refusal, may_move_by_plan, topic_of
 from fleet.policy.state import PolicyState, carry_over, on_hub_back, restore, to_persisted
 from schemas import keys, messages
 from schemas.bus import HubKeeper
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.limits import SHUTDOWN_S
 from schemas.process.computer_sleep import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.rights import People
 from schemas.words import Level, Phase
@@ -41,6 +45,7 @@ SINGLETON_RECHECK_S: Final = 1.0
 """
 _MAX_STATE_QUERIES: Final = 3
 """Maximum number of queries for the cars' states at the start. A stalled gateway may miss the first one."""
+T = TypeVar("T")
 _PLAN_SET: Final = "plan_set"
 _UNSAVED: Final = "It cannot be saved: a restarted coordinator will not know it."
 
@@ -68,6 +73,8 @@ class Coordinator:
     _state_file: CoordinatorStateFile | None = None
     _restored: bool = False
     """True once the persisted state is restored."""
+    _persisted: PolicyState | None = None
+    """The state to persist from now on, because the coordinator is ending. None before that."""
     _early: list[zenoh.Query] = field(default_factory=list)
     """Commands that came before the persisted state was restored."""
     _inbox: Inbox = field(init=False)
@@ -79,8 +86,12 @@ class Coordinator:
         self._publications = Publications(self.client, self.on_failure)
         self._commands = OpenCommands(self.client, self.on_failure)
 
-    def run(self, has_ended: Callable[[], bool]) -> None:
-        """Coordinate until `has_ended()`. Afterwards the cars keep their modes. Raises AnotherCoordinator."""
+    def run(self, has_ended: Callable[[], bool], gives_up: Callable[[], bool] = lambda: False) -> None:
+        """Coordinate until `has_ended()`. Then bring the cars of the plan to rest, until `gives_up()`.
+
+        In a run of `fleet up`, the cars keep their modes: the supervisor stops them, or starts the coordinator again.
+        Raises AnotherCoordinator, and then leaves the cars to the other one.
+        """
         bus, fleet = self.client.bus, self.client.name
         declare_alone(self.client)
         observer = FleetObserver(self.listed)
@@ -92,8 +103,7 @@ class Coordinator:
         for verb in (PLAN_VERB, *PlanRequest):
             for expression in keys.command_keys(fleet, keys.COORDINATOR, verb):
                 bus.queryable(expression, self._inbox.on_query)
-        recheck_at: float | None = time.monotonic() + SINGLETON_RECHECK_S
-        link, hub_keeper = bus.link, HubKeeper(bus.endpoint, self.on_failure)
+        recheck_at = time.monotonic() + SINGLETON_RECHECK_S
         with ThreadPoolExecutor(max_workers=32) as pool:
             try:
                 self._drain_inbox(observer, pool, wait_s=0.0)
@@ -107,34 +117,59 @@ class Coordinator:
                 self._restored = True
                 for query in self._early:
                     self._answer(query, observer)
-                while not has_ended():
-                    # Read the link before the inbox. If it is gone at that moment, the inbox says afterwards which
-                    # gateways were lost with it.
-                    current_link = bus.link
-                    self._drain_inbox(observer, pool)
-                    now = time.monotonic()
-                    self._check_sleep(observer, now)
-                    hub_keeper.check(connected=bool(current_link))
-                    if not current_link:
-                        continue
-                    if current_link != link:
-                        link, self._memory = current_link, on_hub_back(self._memory, now)
-                    try:
-                        self._step(observer, pool, now)
-                    except OSError:  # our own output is closed, because the parent process has ended
-                        raise
-                    except Exception as error:  # noqa: BLE001 - the input came over the bus
-                        self._publications.log_internal_error("deciding", error)
-                    if recheck_at is not None and now >= recheck_at:
-                        recheck_at = None
-                        yield_to_another(self.client)
-                    self._publications.republish(now)
-                if not self.run_name and self._memory.stopped_by:
-                    # A person who ends a coordinator by hand and starts another one wants the plan to run. So forget
-                    # that it was stopped.
-                    self._save(replace(self._memory, stopped_by="", to_rest=frozenset()))
+                try:
+                    self._coordinate(observer, pool, recheck_at, has_ended)
+                finally:
+                    if not self.run_name and not isinstance(sys.exception(), AnotherCoordinator):
+                        self._bring_to_rest(observer, pool, gives_up)
             finally:
                 self.client.close()  # ends pending commands
+
+    def _coordinate(
+        self, observer: FleetObserver, pool: ThreadPoolExecutor, recheck_at: float, has_ended: Callable[[], bool]
+    ) -> None:
+        """Coordinate until `has_ended()`. At `recheck_at`, search once more for other coordinators."""
+        bus = self.client.bus
+        link, hub_keeper = bus.link, HubKeeper(bus.endpoint, self.on_failure)
+        while not has_ended():
+            # Read the link before the inbox. If it is gone at that moment, the inbox says afterwards which gateways
+            # were lost with it.
+            current_link = bus.link
+            self._drain_inbox(observer, pool)
+            now = time.monotonic()
+            self._check_sleep(observer, now)
+            hub_keeper.check(connected=bool(current_link))
+            if not current_link:
+                continue
+            if current_link != link:
+                link, self._memory = current_link, on_hub_back(self._memory, now)
+            self._try_step(observer, pool, now)
+            if now >= recheck_at:
+                recheck_at = inf
+                yield_to_another(self.client)
+            self._publications.republish(now)
+
+    def _bring_to_rest(self, observer: FleetObserver, pool: ThreadPoolExecutor, gives_up: Callable[[], bool]) -> None:
+        """Bring the cars of the plan to rest, as `fleet plan stop` does. Wait for at most SHUTDOWN_S.
+
+        A person who ends a coordinator by hand and starts another one wants the plan to go on. So the persisted state
+        stays that from before.
+        """
+        self._persisted = replace(self._memory, stopped_by="", to_rest=frozenset())
+        shown, until = self.on_decision, time.monotonic() + SHUTDOWN_S
+        self.on_decision = lambda decision: _if_possible(shown, decision)
+        by = self.client.sender.removeprefix(SENDER)
+        self._memory, _ = on_request(PlanRequest.STOP, self.plan, self._memory, by, time.monotonic())
+        self._save(self._memory)
+        cars = moving = sorted(self._memory.to_rest)
+        while moving and self.client.bus.link and time.monotonic() < until and not gives_up():
+            self._try_step(observer, pool, time.monotonic())
+            self._drain_inbox(observer, pool)
+            asked = {each.car for each in self._memory.decisions.values() if each.kind is DecisionKind.IDLE}
+            moving = [car for car in cars if car in asked or may_move_by_plan(observer.cars.get(car, UNKNOWN_CAR))]
+        if moving:
+            names = ", ".join(moving)
+            _if_possible(self.on_failure, f"NOT CONFIRMED: {names} may still be moving. Type `fleet stop`.")
 
     def _check_sleep(self, observer: FleetObserver, now: float) -> None:
         """After a sleep of the computer, decide only by new readings. No car loses its role because of the sleep."""
@@ -143,6 +178,14 @@ class Coordinator:
             self._memory = on_hub_back(self._memory, now)
 
     # ------------------------------------------------------------------ one step
+
+    def _try_step(self, observer: FleetObserver, pool: ThreadPoolExecutor, now: float) -> None:
+        try:
+            self._step(observer, pool, now)
+        except OSError:  # our own output is closed, because the parent process has ended
+            raise
+        except Exception as error:  # noqa: BLE001 - the input came over the bus
+            self._publications.log_internal_error("deciding", error)
 
     def _step(self, observer: FleetObserver, pool: ThreadPoolExecutor, now: float) -> None:
         for command, outcome in self._commands.outcomes():
@@ -172,7 +215,8 @@ class Coordinator:
     def _save(self, memory: PolicyState) -> bool:
         """Persist the state. Return False if it cannot be written."""
         assert self._state_file is not None
-        return self._state_file.save(to_persisted(self.plan, memory, time.monotonic(), time.time()))
+        kept = memory if self._persisted is None else self._persisted
+        return self._state_file.save(to_persisted(self.plan, kept, time.monotonic(), time.time()))
 
     def _check_sender(self, observer: FleetObserver, by: str) -> None:
         check_sender(observer.people if self.people is None else self.people, by)
@@ -291,3 +335,9 @@ class Coordinator:
                 self._on_request(query, PlanRequest(verb), observer)
             return
         self._publications.reply(query)
+
+
+def _if_possible(report: Callable[[T], None], what: T) -> None:
+    """Report something, unless our own output is closed. The cars come to rest all the same."""
+    with suppress(OSError):
+        report(what)

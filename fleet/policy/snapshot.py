@@ -18,6 +18,7 @@ from gateway import drivers
 from schemas import messages, topics
 from schemas.car_profile import CarProfile
 from schemas.messages import Observation
+from schemas.words import Motors
 
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
@@ -167,6 +168,12 @@ def _profile(platform: str) -> CarProfile | None:
 
 
 UNKNOWN_CAR: Final = CarSnapshot()
+
+
+def may_move_by_plan(known: CarSnapshot) -> bool:
+    """Return True if a car that a plan commanded may still be moving, and no person has taken it."""
+    is_free = known.taken_by is None and known.driven_by is None
+    return known.present and is_free and known.motors != Motors.OFF
 
 
 class FleetSnapshot(Struct, frozen=True):

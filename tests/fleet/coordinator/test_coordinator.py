@@ -1,6 +1,7 @@
 """`fleet plan run` as a process with real gateways. It enforces a plan, but never against a hold."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -15,7 +16,7 @@ from fleet.client.client import Fleet, default_sender
 from schemas import bus
 from schemas.keys import person_of
 from tests.fleet.conftest import Cars, asked
-from tests.support.processes import LONG_S, GatewayProcess, wait_for
+from tests.support.processes import LONG_S, GatewayProcess, driving, wait_for
 from tests.support.up import fleet_command
 
 PLAN = """
@@ -110,7 +111,8 @@ def test_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> No
 
     assert process.end(signal.SIGINT) == 0
     assert "Traceback" not in process.stderr
-    assert truth(cars, "red") == "tracking", "cars keep their modes"
+    assert "NOT CONFIRMED" not in process.stderr
+    assert (truth(cars, "red"), driving(cars.sim, "red")) == ("manual", False), "Ctrl-C brings its cars to rest"
     messages: dict[str, list[Any]] = {}
     for sample in seen:
         messages.setdefault(sample.key, []).append(sample.message())
@@ -121,7 +123,7 @@ def test_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> No
     decisions = messages["fleet/@coordinator/decision"]
     assert [each.seq for each in decisions] == list(range(1, len(decisions) + 1))
     assert {each.subject for each in decisions} == {"red", "green", "role tracking", "role manual"}
-    last = messages["fleet/@coordinator/assignment"][-1]
+    *_, last = [each for each in messages["fleet/@coordinator/assignment"] if not each.stopped_by]
     assert {role.name: list(role.cars) for role in last.roles} == {"manual": ["green"], "tracking": ["red"]}
 
 
@@ -359,6 +361,22 @@ def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: 
         client.car("blue").resume().check()
     assert truth(cars, "red") == "tracking"
     assert following.end(signal.SIGTERM) == 0
+    assert (truth(cars, "red"), driving(cars.sim, "red")) == ("manual", False)
+
+
+def test_car_that_does_not_react_at_the_end_is_named_and_next_ctrl_c_ends_at_once(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
+    lines = Lines(process)
+    lines.until("red", "tracking", "role tracking")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    cars.sim.say({"car": "red", "fault": "deaf"})
+    try:
+        os.kill(process.pid, signal.SIGINT)
+        lines.until("red", "manual", "red is brought to rest")
+        assert process.end(signal.SIGINT) == 0
+        assert "NOT CONFIRMED: red may still be moving" in process.stderr
+    finally:
+        cars.sim.say({"car": "red", "fault": "deaf", "for_s": 0})
 
 
 def test_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path) -> None:
