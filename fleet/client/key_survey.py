@@ -48,7 +48,8 @@ class KeySurvey:
 
     def add(self, reading: Reading, now: datetime) -> None:
         """Add a reading."""
-        if reading.age_s(now) <= self._duration_s:
+        has_number = getattr(reading.value, "seq", 0) > 0  # the answer to a query may have none
+        if has_number and reading.age_s(now) <= self._duration_s:
             first = self._first.get(reading.key)
             if first is None or reading.time < first.time or _is_other_publisher(first, reading):
                 self._first[reading.key] = reading
@@ -65,7 +66,7 @@ class KeySurvey:
         if newest is None:
             return KeyInfo(key, topic)
         rate = None
-        if first is not None and newest.value.DESCRIPTOR.fields_by_name.get("seq") is not None:
+        if first is not None:
             count = newest.value.seq - first.value.seq
             apart_s = (newest.time - first.time).total_seconds()
             # A short burst after a change says nothing about the rate.

@@ -2,7 +2,6 @@
 
 import asyncio
 import http.client
-import ipaddress
 import json
 import os
 import signal
@@ -49,19 +48,14 @@ if TYPE_CHECKING:
 
 DEFAULT_LAN_PORT: Final = 7443
 HEARTBEAT_INTERVAL_S: Final = 1.0
-_LOOPBACK_NAMES: Final = ("localhost", "::1")
 _PROBE_TIMEOUT_S: Final = 1.0
 
 
 def _check_host(_: click.Context, __: click.Parameter, host: str) -> str:
-    """Refuse every address but loopback. The page is at 127.0.0.1 whatever the address."""
-    try:
-        is_loopback = host in _LOOPBACK_NAMES or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        is_loopback = False
-    if not is_loopback:
+    """Refuse every other address than the one of the page."""
+    if host not in (LOOPBACK, "localhost"):
         raise click.UsageError(
-            f"Without a pairing the console serves this computer only, not {host}. "
+            f"Without a pairing the console serves this computer only, at {LOOPBACK}, not {host}. "
             "For phones and other computers, type: fleet console --lan"
         )
     return host
@@ -121,7 +115,7 @@ examples:
     show_default=True,
     callback=_check_host,
     expose_value=False,
-    help="Without effect: the page is always at 127.0.0.1. An address other than loopback is refused.",
+    help="Any other address is refused: the page is for this computer only, except with --lan.",
 )
 @click.option("--lan", "on_lan", is_flag=True, help="Also serve paired devices on the network, over HTTPS.")
 @click.option(
@@ -135,7 +129,7 @@ examples:
     "--sessions",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help="Show the sessions in DIR (default: sessions, or if there is none here, as in the fleet file here).",
+    help="Show the sessions in DIR (default: as in the fleet file here, or sessions).",
 )
 @click.option(
     "--fleet-file",
@@ -267,8 +261,10 @@ def people(revoke: tuple[str, ...], *, as_json: bool, connect: str | None, fleet
 
 
 def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
-    known = {word for each in file.read().devices for word in (each.id, each.person.name)}
-    if missing := [name for name in names if name not in known]:
+    book = file.read()
+    known = {word for each in book.devices for word in (each.id, each.person.name)}
+    coded = {each.person.name for each in book.codes if each.is_open(time.time())}
+    if missing := [name for name in names if name not in known | coded]:
         raise click.UsageError(
             f"No paired device has the id or person {missing[0]!r}. `fleet console people` lists them."
         )
@@ -278,6 +274,8 @@ def _revoke(file: PeopleFile, names: tuple[str, ...]) -> None:
         raise _not_written(file, error) from None
     for each in revoked:
         click.echo(f"{each.id} ({each.person.name}) is revoked. Its pages are closed.")
+    for name in sorted(coded.intersection(names)):
+        click.echo(f"The open code of {name} is revoked.")
 
 
 def _people_of(file: Path) -> People:

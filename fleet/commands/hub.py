@@ -32,6 +32,7 @@ from schemas.bus.hub_links import LINKS_FILE
 from schemas.identity import IdentityRole, Service
 from schemas.printable import printable
 from schemas.running_cars import running_cars
+from schemas.state_dir import joined_endpoint
 from schemas.words import Rank
 
 DEFAULT_FLEET_FILE: Final = Path("fleet.yaml")
@@ -297,7 +298,7 @@ def leave() -> None:
     On the hub's own computer, its authority and certificates stay, and only the use of the hub ends.
     """
     with cli_errors(), _disk_errors():
-        if cars := running_cars(resolve_endpoint()):
+        if joined_endpoint() and (cars := running_cars(resolve_endpoint())):
             raise click.ClickException(
                 f"gateways run here ({', '.join(cars)}). They would lose their certificate while their cars may move. "
                 "End them first (`fleet down`, Ctrl-C, or `systemctl stop`)"

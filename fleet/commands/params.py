@@ -163,7 +163,7 @@ def session_argument(function: Callable[..., Any]) -> Callable[..., Any]:
         is_eager=True,
         expose_value=False,
         callback=_place,
-        help="Search for SESSION in DIR (default: sessions, or if there is none here, as in the fleet file here).",
+        help="Search for SESSION in DIR (default: as in the fleet file here, or sessions).",
     )
     return place(click.argument("session", type=SessionPath(), default="latest", metavar="[SESSION]")(function))
 

@@ -32,6 +32,7 @@ from schemas.words import Phase, Reason, RunState
 
 _OWN_MODULES: Final = {"run": "fleet.commands.plan_run:run", "try": "fleet.commands.plan_try:try_plan"}
 """Subcommands whose imports would slow down all others."""
+_NOBODY: Final = "nobody has stopped, borrowed or drives it"
 
 
 @click.command(
@@ -79,10 +80,10 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
     found = {reading.value.subject: reading for reading in client.get(key)}
     people, motors = _people(client, subjects)
     if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
-        if not people or any(car not in people for car in subjects):
+        if not (subjects or people) or any(car not in motors for car in subjects):
             raise click.ClickException(_no_plan(client))
-        for car, deeds in people.items():
-            words = "; ".join(deeds)
+        for car in subjects or people:
+            words = "; ".join(people.get(car, [_NOBODY, f"motors {motors[car].words}"]))
             say(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}. No plan is running.")
         return
     if not found and not subjects:

@@ -97,7 +97,7 @@ def _open(path: Path) -> "Session":
 def list_sessions(directory: Path | None, *, as_json: bool) -> None:
     """List the sessions in DIR: start, state, length, size, lost messages, stops, marks and cars.
 
-    By default, DIR is `sessions`, or if there is none here, that of the fleet file here. A stop of several cars counts
+    By default, DIR is that of the fleet file here, or `sessions`. A stop of several cars counts
     once, whoever asked for it. The list also shows damaged sessions, and what is damaged, as far as their indexes tell.
     Only `fleet sessions verify` finds all damage.
     """

@@ -25,13 +25,17 @@ class NoLatest(LookupError):
 
 
 def sessions_place() -> Path:
-    """Return the directory of sessions: `sessions` here, or, without it, the one that the fleet file here names."""
-    if not DEFAULT_SESSIONS.is_dir() and _FLEET_YAML.is_file():
-        from fleet.fleetfile.fleet_file import read_fleet
+    """Return the directory of sessions: the one that the fleet file here names, or else `sessions`.
 
-        with suppress(ValueError):  # BadFile is a ValueError
-            return read_fleet(_FLEET_YAML, unbound=True).recordings or DEFAULT_SESSIONS
-    return DEFAULT_SESSIONS
+    `fleet up` records there. But if only `sessions` exists, return it.
+    """
+    named: Path | None = None
+    with suppress(OSError, ValueError):  # BadFile is a ValueError
+        if "record" in _FLEET_YAML.read_text(encoding="utf-8"):  # otherwise, do not load the parser, which takes long
+            from fleet.fleetfile.fleet_file import read_fleet
+
+            named = read_fleet(_FLEET_YAML, unbound=True).recordings
+    return named if named is not None and (named.is_dir() or not DEFAULT_SESSIONS.is_dir()) else DEFAULT_SESSIONS
 
 
 def sessions_in(place: Path) -> Iterator[Path]:

@@ -118,6 +118,8 @@ def reading(topic: str, seq: int, age_s: float, boot: str = "a", **fields: Any) 
         ([(7, 60.0)], None, 60.0),
         ([(1, 0.02), (2, 0.0)], 0.4, 0.0),  # two that arrived together count as two
         ([(3, 0.0), (1, 2.0)], 1.0, 0.0),  # in any order
+        ([(0, 2.0), (900, 1.0)], None, 1.0),  # an answer to a query may have no number
+        ([(0, 2.0), (900, 1.0), (901, 0.0)], 1.0, 0.0),
     ],
 )
 def test_rate_is_counted_by_the_publishers_numbers(

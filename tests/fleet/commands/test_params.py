@@ -122,13 +122,19 @@ def test_session_argument_is_newest_or_named(
     assert words in result.output
 
 
-def test_without_a_directory_here_the_fleet_file_names_the_place(
+def test_sessions_are_where_the_fleet_file_here_records(
     place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.rename(tmp_path / "elsewhere")
     (tmp_path / "fleet.yaml").write_text("cars: {red: {link: /dev/ttyUSB0}}\nrecord: {to: elsewhere}\n")
     monkeypatch.chdir(tmp_path)
     seen: list[Any] = []
     command = click.command()(session_argument(lambda session: seen.append(session)))  # noqa: PLW0108 - click calls it by name
     CliRunner().invoke(command, ["latest~1"])
-    assert [each.name for each in seen] == ["20260201T000000Z-fleet"]
+    assert seen == [Path("sessions/20260201T000000Z-fleet")], "nothing was recorded there yet"
+    place.rename(tmp_path / "elsewhere")
+    for remains in (False, True):
+        if remains:
+            place.mkdir()
+        CliRunner().invoke(command, ["latest~1"])
+        assert (seen[-1].parent.name, seen[-1].name) == ("elsewhere", "20260201T000000Z-fleet")
+    assert len(seen) == 3

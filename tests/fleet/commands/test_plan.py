@@ -49,6 +49,15 @@ def test_without_a_plan_each_command_names_what_works(tmp_path: Path) -> None:
         safety.estops.add(id="1", by="bob", why="fire")
         estopped = "red: e-stopped by bob: fire; `fleet resume red --estops` ends it; on "
         assert run("why", "red").stdout.startswith(complete_hints(estopped, options))
+        stopped = pb.Safety()
+        stopped.CopyFrom(safety)
+        safety.CopyFrom(pb.Safety(car="red", motors="off", motors_basis="shown"))
+        free = run("why", "red")
+        assert (free.exit_code, free.stderr) == (0, "")
+        assert (
+            free.stdout == "red: nobody has stopped, borrowed or drives it; motors off (shown). No plan is running.\n"
+        )
+        safety.CopyFrom(stopped)
         safety.loan.CopyFrom(pb.Loan(to="eve", by="ann@lab-1", rank="lead", expires_in_s=60))
         safety.loan.since.seconds = at = 1_790_000_000
         safety.pauses.add(by="ann@lab-1", rank="lead", why="listen").stamp.seconds = at

@@ -2,6 +2,7 @@
 
 import ssl
 import stat
+import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -90,6 +91,15 @@ def test_people_file_is_private_shared_and_survives_damage(tmp_path: Path) -> No
     assert [each.id for each in theirs.read().devices] == ["d"]
     path.write_text("{")
     assert theirs.read() == PeopleBook()
+
+
+def test_open_code_of_a_person_without_device_is_revoked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    people = PeopleFile(people_path(resolve_endpoint(None), "fleet"))
+    people.change(lambda book: (book.issue("K7QF3MXP", PagePerson("mia"), time.time()), None))
+    done = CliRunner().invoke(cli, ["console", "people", "--revoke", "mia"])
+    assert (done.exit_code, people.read().codes) == (0, ()), done.output
+    assert CliRunner().invoke(cli, ["console", "people", "--revoke", "mia"]).exit_code == 2
 
 
 def test_revoking_tells_that_people_file_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

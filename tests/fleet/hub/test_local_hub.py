@@ -10,7 +10,7 @@ from fleet.hub.local_hub import SECURE_ENDPOINT, store_joined
 from schemas.bus.credentials import Credentials, NoCredentials
 from schemas.identity import Service, service
 from schemas.running_cars import RunningMark
-from schemas.state_dir import directory_of
+from schemas.state_dir import DEFAULT_ENDPOINT, directory_of
 from tests.support import in_process
 
 
@@ -47,6 +47,8 @@ def test_leave_refuses_beside_running_gateways(monkeypatch: pytest.MonkeyPatch, 
     mark.end()
     assert in_process.fleet("leave").returncode == 0
     assert not Credentials.of(endpoint).exist
+    RunningMark(directory_of(DEFAULT_ENDPOINT), "fleet", "red").renew()
+    assert "has not joined a hub" in in_process.fleet("leave").stderr
 
 
 def test_service_invited_elsewhere_is_taken_back(monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> None:
