@@ -12,7 +12,7 @@ import click
 examples:
   fleet scan
   fleet scan --link /dev/ttyUSB0
-  fleet scan --probe             # also send a stop, which wakes silent cars: every car that is found stops
+  fleet scan --probe             # also send a stop, which stops cars in mode manual
   fleet scan --json > report.json
 
 Opening a USB port can reset an Arduino. `fleet scan` does not search for TCP cars, because their program ends
@@ -20,7 +20,7 @@ when a connection to it ends."""
 )
 @click.option("--link", "links", multiple=True, metavar="URL", help="Look only at this link. Repeatable.")
 @click.option("--for", "listen", metavar="DURATION", help="How long to listen at each port (default: 6s).")
-@click.option("--probe", is_flag=True, help="Send a stop to cars and to silent ports. Every car that is found stops.")
+@click.option("--probe", is_flag=True, help="Send a stop to cars and to silent ports. It stops cars in mode manual.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
 def scan(links: tuple[str, ...], listen: str | None, *, probe: bool, as_json: bool) -> None:
     """Look for cars on Bluetooth and serial ports. Without --probe, it only listens. No scan makes a car move."""

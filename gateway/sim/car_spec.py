@@ -23,7 +23,7 @@ class PtyPath(Struct, frozen=True):
     """A pseudo terminal.
 
     At `path`, the simulator makes a symlink to it. The symlink has the same name again when a lost link returns, while
-    the terminal itself has a new one. If `path` is None, there is no symlink.
+    the terminal itself may have another one. If `path` is None, there is no symlink.
     """
 
     path: str | None = None

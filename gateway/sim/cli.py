@@ -28,8 +28,8 @@ PARENT_CHECK_INTERVAL_S: Final = 0.1
 RATES: Final = (0.01, 100.0)
 
 EPILOG: Final = """\
-The command prints one JSON line per car: {"car", "platform", "link"}. Give the link to `gateway run --link`. After each
-link_drop, a plain pty has another name, so the line is printed again. With pty:PATH the name stays the same.
+The command prints one JSON line per car: {"car", "platform", "link"}. Give the link to `gateway run --link`. After a
+link_drop, a plain pty often has another name. Then the line is printed again. With pty:PATH the name stays the same.
 
 options of a platform that real cars have, too; join several with + (--car red:arduino+arm+interval=0.71:pty):
   +arm +imu                             the car has an arm; the car has a gyroscope
@@ -49,17 +49,20 @@ options of the simulator only:
   +gray=MAX                             the grayscale values go up to MAX (arduino, stm32)
   +constants                            the values of line, obstacle, light and grayscale never change (arduino, stm32)
 options of wave_rover, ugv01, ugv02, ugv_rover and ugv_beast, which have no others:
-  +mission                              the car drives for 2 s in the mission that it runs after its boot
+  +mission                              after each reset, the car plays a mission: a wave_rover, ugv01 or ugv02 drives
+                                        for 2 s, and the others obey nothing for as long
   +no_encoder                           the left encoder counts nothing
   +quiet                                the car does not send back the lines that it gets
-  +arm                                  the car reports an arm instead of angles
+  +arm                                  the car reports an arm in place of its yaw (ugv_rover, ugv_beast: in place of
+                                        its accelerations), until T:900 says that there is no arm
   +gimbal                               the car searches for a gimbal that is not there
 An stm32 car reports by a timer, and no frame blocks it. A course car runs a Raspberry Pi program that knows only the
 frames for motions, the whistle and the lights. The program sends nothing, and ends with an error at any other frame.
 faults on the command line (AMOUNT is seconds, but bytes for garbage; --fault may be repeated):
   --fault red:link_drop@5+2             the link is gone for 2 s; without +2 until you end the fault
-  --fault red:rename@5+2                the car comes back as another device: pty:PATH points to it, a plain pty and TCP
-                                        have a new link; with ,path=/tmp/other it comes back at that path
+  --fault red:rename@5+2                the link is gone for 2 s (without +2 for 1 s), and comes back as another device:
+                                        pty:PATH points to it, a plain pty and TCP have a new link; with
+                                        ,path=/tmp/other it comes back at that path
   --fault red:cut_write@5+2,bytes=7     only 7 bytes of the next frame reach the car, and then the link is gone for 2 s
   --fault red:slow@5+10,factor=0.1      both directions run at a tenth of 960 bytes/s, byte by byte
   --fault red:lossy@5+10,share=0.2      a fifth of the bytes is lost; ,to=car or ,to=host: only in this direction
@@ -70,14 +73,16 @@ faults on the command line (AMOUNT is seconds, but bytes for garbage; --fault ma
   --fault red:firehose@5+10,rate=1e6    the car sends a million random bytes/s besides its readings; with ,of=frame
                                         these bytes are a frame that never ends
   --fault red:garbage@5+200             200 random bytes reach the host; with ,to=car they reach the car
-  --fault brownout@10                   every car resets; with red: before it, only red
+  --fault brownout@10                   every car resets; with red: before brownout, only red does
   --fault red:empty@5+20                the battery runs empty within 20 s; then the car is off, and its link is gone
-Faults on stdin are one JSON object per line. One line on stdout answers each. "for_s": 0 ends a fault (rename and
-cut_write end as link_drop does); without "for_s", a fault lasts until you end it:
+Faults on stdin are one JSON object per line. One line on stdout answers each. "for_s": 0 ends a fault. A
+link_drop with 0 also brings back a link that a rename or a cut_write has cut. Without "for_s", a fault lasts until you
+end it, but a rename cuts the link for 1 s, and empty takes 20 s:
   {"car": "red", "fault": "lossy", "for_s": 10, "share": 0.2, "to": "car"}
 The infrared remote: only an Arduino or STM32 car in mode remote_control obeys it. A ugv car has no remote, so a button
-here is a button of its web page. A motion lasts until the next button. The buttons are forward, back, left, right,
-spin_left, spin_right, stop, whistle, faster and slower.
+here is a button of its web page, which has no whistle, faster and slower. A motion lasts until the next button, or
+until the mode is closed. The buttons are forward, back, left, right, spin_left, spin_right, stop, whistle, faster and
+slower.
   --ir red:forward@5                    on stdin {"car": "red", "ir": "forward"}
 A world from a file can have lamps that light sensors see, things to bump into and to follow, and cars that see each
 other and block each other's way. `fleet example copy follow` writes such a file with a comment for each field. On
@@ -88,7 +93,7 @@ The true state, on stdin:
   {"car": "red", "ask": "truth"}        mode, motors, pose, ...; for a replay: bytes sent and ignored, rounds
   {"ask": "world"}                      every lamp and thing: where it is, whether it is on, its size and speed
 Replays: a file of `gateway monitor --raw` is played as a car, with its timing. It ignores what you send to it. Over TCP
-it begins when a host connects, over a pty at once:
+it begins when the first host connects, over a pty at once:
   gateway sim --replay red.raw:red:tcp --loop --rate 2
 """
 

@@ -21,7 +21,7 @@ _FILE_TIME_MARGIN_S = 2.0
 
 
 class EndpointError(Exception):
-    """A link cannot be opened. The message says why, and what to do about it."""
+    """A link cannot be opened or renamed. The message says why."""
 
 
 class Taken(EndpointError):
@@ -52,7 +52,7 @@ class SimEndpoint(Protocol):
         """The URL that a gateway opens."""
 
     async def up(self) -> None:
-        """Open the link for a host. Raises EndpointError if the port or path is taken."""
+        """Open the link for a host. Raises EndpointError if it cannot open: its port or path may be taken."""
 
     async def down(self) -> None:
         """Close the link, as when a cable is unplugged or a network is lost. `up` opens it again."""
@@ -78,7 +78,7 @@ class SimEndpoint(Protocol):
         """Read unless the link is held or stuck."""
 
     def rename(self, path: str | None) -> None:
-        """Become another device at the next `up`, at `path` if not None. Raises EndpointError."""
+        """Become another device at the next `up`, at `path` if not None. Raises EndpointError if that cannot be."""
 
     async def close(self) -> None:
         """Close the link for good, and remove its symlink or sockets."""
@@ -249,7 +249,7 @@ class TcpEndpoint(SimEndpoint):
         return f"tcp://[{self._host}]:{self._port}" if ":" in self._host else f"tcp://{self._host}:{self._port}"
 
     async def up(self) -> None:
-        """Listen. From the second time on, use the port of the first time again."""
+        """Listen. From the second time on, use the port of the last time again, unless `rename` has bound another."""
         if self._server is not None:
             return
         loop = asyncio.get_running_loop()

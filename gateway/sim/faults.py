@@ -40,14 +40,18 @@ class FaultKind(StrEnum):
 
 
 class Fault(Struct, frozen=True):
-    """One fault. Without `car` it hits every car. A kind ignores the fields that `_FIELDS` does not list for it."""
+    """One fault. Without `car` it hits every car that it can hit (see `targets`).
+
+    A kind ignores the fields that `_FIELDS` does not list for it.
+    """
 
     kind: FaultKind
     car: str | None = None
     for_s: float | None = None
     """Duration in seconds. 0 ends the fault now. With None, it lasts until a fault of the same kind with 0 ends it.
 
-    `link_drop` with 0 ends every loss of the link. For `empty`: the time until the battery is empty.
+    For `rename` and `cut_write`, it is the duration of the loss of the link that they begin. Only a `link_drop` with 0
+    ends that: it ends every loss of the link. For `empty`: the time until the battery is empty.
     """
     bytes: int = 0
     """Number of bytes of garbage, or number of bytes of the next frame that still reach the car before the cut."""
@@ -65,7 +69,7 @@ class Fault(Struct, frozen=True):
 
 
 class Press(Struct, frozen=True):
-    """A press of a button of the remote. Without `car` it is sent to every car."""
+    """A press of a button of the remote. Without `car` it is sent to every simulated car."""
 
     button: Button
     car: str | None = None

@@ -218,7 +218,7 @@ class SimCar:
         return obeyed
 
     async def inflict(self, fault: Fault) -> None:
-        """Carry out a fault now. Raises EndpointError if a lost link cannot be opened again."""
+        """Carry out a fault now. Raises EndpointError if a link cannot be renamed, or not be opened again."""
         self._pump()
         now = self._loop.time()
         until = inf if fault.for_s is None else now + fault.for_s
@@ -369,7 +369,11 @@ class Simulation:
             await car.stop()
 
     async def inflict(self, fault: Fault) -> list[str]:
-        """Carry out a fault on one car or all. Return the names of these cars. Raise BadSpec for an unknown car."""
+        """Carry out a fault on one car or all. Return the names of these cars.
+
+        Raises BadSpec if a car is unknown or cannot have this fault, and EndpointError if the link of a car cannot be
+        renamed, or not be opened again. Then the cars after it are left out.
+        """
         names = targets([car.spec for car in self.cars.values()], fault)
         for name in names:
             await self.cars[name].inflict(fault)
@@ -388,6 +392,9 @@ class Simulation:
         return as_it_is(self.world, now)
 
     def press(self, press: Press) -> list[str]:
-        """Press a button for one car or all; return the names of those that obey. Raise BadSpec for an unknown car."""
+        """Press a button for one car or all; return the names of those that obey.
+
+        Raises BadSpec if the car is unknown, or if there are only captures.
+        """
         names = targets([car.spec for car in self.cars.values()], press)
         return [name for name in names if self.cars[name].press(press.button)]

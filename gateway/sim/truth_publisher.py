@@ -31,7 +31,7 @@ HUB_WARNING_DELAY_S: Final = 10.0
 
 
 class TruthPublisher:
-    """Publishes every car of a simulation as soon as there is a hub."""
+    """Publishes every simulated car of a simulation as soon as there is a hub. A capture has no true state."""
 
     def __init__(
         self, simulation: Simulation, endpoint: str, fleet: str, warn: Callable[[str], object] = lambda _: None

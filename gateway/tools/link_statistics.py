@@ -17,7 +17,7 @@ from schemas.words import FrameVerdict, Platform
 
 
 class LinkStatistics(Struct):
-    """Counts of the events of one link. Times are in seconds since the start."""
+    """Counts of the events of one link. Times are in seconds from any origin."""
 
     since: float | None = None
     until: float = 0.0

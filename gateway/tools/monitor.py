@@ -1,6 +1,6 @@
 """`gateway monitor`: prints a car's bytes beside their decoded readings, live or from a file. Sends nothing.
 
-`MonitorOutput` prints the events; `statistics` describes and counts them.
+`MonitorOutput` prints the events; `link_statistics` describes and counts them.
 """
 
 import argparse

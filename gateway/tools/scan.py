@@ -29,12 +29,13 @@ EPILOG: Final = """\
 examples:
   gateway scan                              list and listen, but send nothing
   gateway scan --json                       print one JSON object per line
-  gateway scan --link /dev/ttyUSB0 --probe  stop the car there, and wake it if it is silent
+  gateway scan --link /dev/ttyUSB0 --probe  also stop the car there, if it is in mode 0
 
 Opening a serial port can reset an Arduino that is on a USB cable. `gateway scan` skips ports that another program uses.
 It lists Bluetooth devices without a connection to them. It never searches for TCP cars, because the end of a connection
-ends their program. With --probe it stops every car that it finds and closes its mode. It sends nothing to ports that
-send other data."""
+ends their program. With --probe it sends general stops to every car that it finds and to silent ports. They stop a car
+in mode 0. They close no mode: in another mode, most cars ignore them, and a silent car stays silent. It sends nothing
+to ports that send other data."""
 
 # Opening its port resets an Arduino, which starts within 2 s. In mode 0 a car reports once a second, and three readings
 # show its platform.
@@ -54,7 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DURATION",
         help=f"how long to listen (default: {DEFAULT_LISTEN_S:g}s)",
     )
-    parser.add_argument("--probe", action="store_true", help="send a stop to cars and to silent ports")
+    parser.add_argument(
+        "--probe", action="store_true", help="send a stop to cars and to silent ports; it stops cars in mode 0"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object per line")
 
 
@@ -229,9 +232,9 @@ def _words(probe: LinkProbe) -> str:
         case LinkVerdict.OTHER:
             return f"no car: {probe.statistics.words()}"
         case LinkVerdict.SILENT if probe.probed:
-            return "silent, even after the probe: no car, or the car is off or hangs, or its fan runs"
+            return "silent, even after the probe: no car, or the car is off, hangs, is in a silent mode or runs its fan"
         case LinkVerdict.SILENT:
-            return "silent: no car, or the car is off or in a silent mode, or its fan runs (--probe finds out)"
+            return "silent: no car, or the car is off or in a silent mode, or its fan runs"
         case LinkVerdict.BUSY:
             return "in use by another program (its gateway?), so it was not listened to"
         case LinkVerdict.FAILED:

@@ -105,7 +105,11 @@ def raw_bytes(text: str) -> bytes:
 
 
 def check_frame(text: str, profile: Profile, url: LinkUrl) -> bytes:
-    """Return the bytes of the frame. Raises WrongUse if it is not a frame of the protocol, or unknown to this car."""
+    """Return the bytes of the frame.
+
+    Raises WrongUse if it is not a frame of the protocol, if this car does not know it, or if the car would drive behind
+    a link whose end kills the program of a Raspberry Pi car.
+    """
     frame = profile.parse_sent(raw_bytes(text))
     if frame is None:
         raise cli_support.WrongUse(f"frame {text!r}: {why_not(text)} (--raw sends it anyway)")
@@ -172,22 +176,27 @@ def aftermath(frame: Frame | None, profile: Profile, link: str) -> list[str]:
     match frame:
         case General(motion) as general:
             if motion is Motion.STOP:
-                lines.append("its motors are off if it is in mode 0 and was not busy; in another mode it ignores this")
+                lines.append(
+                    "its motors are off if it is in mode 0 and was not busy; in another mode only an stm32 car obeys it"
+                )
             else:
-                lines.append(f"it drives ({motion}) until the next command, even without a link")
+                lines.append(f"in mode 0 it drives ({motion}) until the next command, even without a link")
             if general.fan:
                 lines.append("its fan is toggled; while the fan runs, an arduino car sends no readings")
         case ModeOpen(mode):
             lines.append(
                 f"it is opening mode {mode}, which takes up to {LONGEST_BLOCK_S:g} s. Until then its motors "
-                "stay as they were"
+                "stay as they were (an stm32 car turns them off at once)"
             )
             then = "obeys" if mode in (Mode.REMOTE_CONTROL, Mode.COLOR_LED) else "drives by itself, and obeys"
-            lines.append(f"then it {then} only a mode frame. To stop it, in mode 0: {again} '{_MANUAL}'")
+            lines.append(
+                f"then it {then} only a mode frame (an stm32 car also general frames). To stop it, in mode 0: "
+                f"{again} '{_MANUAL}'"
+            )
         case ModeClose():
-            lines.append("its motors are off and it is in mode 0, as soon as it is not busy (4.3 s in avoidance)")
+            lines.append("its motors are off and it is in mode 0, as soon as it is not busy (up to 4.3 s in avoidance)")
         case Ptz() | ColorLed() | ArmSet():
-            lines.append("its motors do not change; in a mode other than 0 it ignores this")
+            lines.append("its motors do not change; in a mode other than 0 an arduino car ignores this")
         case LoneHash():
             lines.append("this ended half a frame in the car's buffer, and the car may have obeyed that half")
         case None:

@@ -58,7 +58,10 @@ class ArduinoCar(ModeCar):
     # From the host.
 
     def _serial_event(self) -> None:
-        """Append all buffered bytes to ONE string. `#` completes it even outside a frame (row "a lone #")."""
+        """Append the bytes of all buffered frames to ONE string.
+
+        `#` completes it even outside a frame (row "a lone #").
+        """
         if self._traits.last_frame_wins:
             self._keep_last()
             return
@@ -165,7 +168,10 @@ class ArduinoCar(ModeCar):
     # Mode 0.
 
     def _manual(self) -> Program:
-        """Wait for a byte, or send the next frame. While the fan runs, loop turns do not count, so nothing is sent."""
+        """Wait for a byte, or send the next frame.
+
+        While the fan runs, loop turns do not count, so only a hardware timer sends reports.
+        """
         since = self._now
         due = inf if self._fan else since + min(self._due.values(), default=inf)
         yield Wait(due, wakes=True)

@@ -32,13 +32,13 @@ class CaptureCar:
         self.alive: Final = True
 
     def begin(self, now: float) -> None:
-        """Start to play, unless the capture is playing already."""
+        """Start to play, unless the capture has begun before, even if it has ended since."""
         if self._start is None:
             self._start = now
 
     @property
     def done(self) -> bool:
-        """True at the end of the capture."""
+        """True at the end of a capture that does not loop."""
         return self._index >= len(self._pieces)
 
     def feed(self, data: bytes, now: float) -> None:  # noqa: ARG002 - as Firmware.feed
@@ -46,7 +46,7 @@ class CaptureCar:
         self.ignored_bytes += len(data)
 
     def advance(self, now: float) -> list[tuple[float, bytes]]:
-        """Return the pieces since the last call, each with its time."""
+        """Return the pieces that were due since the last call, each with its time."""
         sent = []
         while (due := self.next_event()) <= now:
             data = self._pieces[self._index][1]

@@ -30,7 +30,7 @@ COURSE_FRAMES: Final = frozenset(
         *(_with(7, digit) for digit in "2348"),
     }
 )
-"""The frames that this program knows: one motion, a whistle, or one light."""
+"""The frames that this program knows: a stop, one motion, a whistle, or one light."""
 
 
 class CourseCar(Firmware):

@@ -1,4 +1,4 @@
-"""A link with faults on virtual time: it delays, drops, changes or blocks bytes in either direction.
+"""A link with faults on virtual time: it delays or loses bytes in either direction, and adds bytes to those of the car.
 
 Without faults it passes bytes on unchanged. `endpoints` opens and closes links; `firmware_base` models the UART's rate.
 """

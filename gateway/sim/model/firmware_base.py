@@ -1,4 +1,4 @@
-"""The base of every car's program: one blocking loop on virtual time, a UART each way, motors.
+"""The base of every program but the one in `ugv`: one blocking loop on virtual time, a UART each way, motors.
 
 A program is a generator that yields a `Wait` wherever the real program blocks, so that the code of both looks alike.
 `arduino`, `stm32`, `raspberry_pi` and `course` have the programs, `traits` their parameters, `car_body` the motion and
@@ -101,7 +101,7 @@ class Truth(Struct, frozen=True):
     speed: int
     """The PWM value (0..255) at which the next motion drives."""
     alive: bool
-    """False once a Raspberry Pi program has died."""
+    """False once a Raspberry Pi program has died, until a brownout starts it again."""
 
     @property
     def driving(self) -> bool:
@@ -156,7 +156,7 @@ class Firmware:
         self._speed = 0
         self._rgb = (0, 0, 0)
         self.motor_log: deque[tuple[float, int, int]] = deque([(now, 0, 0)], maxlen=4096)
-        """(time, left, right) of every change of the motors, oldest first."""
+        """(time, left, right) of the last 4096 changes of the motors, oldest first."""
         self.lost_bytes = 0
         """Number of bytes dropped because the receive buffer was full."""
         self._pressed: Button | None = None
@@ -184,7 +184,7 @@ class Firmware:
     def advance(self, now: float) -> list[tuple[float, bytes]]:
         """Run the program up to `now`.
 
-        Return the pieces that the car has sent since the last call, each after the time of its last byte.
+        Return the pieces that the car has sent since the last call, each with the time of its last byte.
         """
         self._run(now)
         sent = []
@@ -209,7 +209,7 @@ class Firmware:
 
     @property
     def alive(self) -> bool:
-        """False once the program has died; it never runs again."""
+        """False once the program has died. Only a brownout starts it again."""
         return self._alive
 
     @property

@@ -32,7 +32,7 @@ FASTEST_M_S: Final = 0.5
 
 
 class Lamp(Struct, frozen=True):
-    """A light that a sensor sees from up to `reach_m` away."""
+    """A light that a sensor sees from up to `seen_from_m` away."""
 
     x_m: float
     y_m: float

@@ -19,7 +19,10 @@ class CarTraits(Struct, frozen=True):
     """The parameters of one car. The defaults are those of the simulated Arduino car."""
 
     interval_s: float = 1.254
-    """Time from one mode-0 report to the next on the wire, with an echo. Without echo, the ranging makes it longer."""
+    """Time from one mode-0 report to the next on the wire, with an echo.
+
+    Without echo, the ranging makes it longer, unless a `timer` sends the reports.
+    """
     spread_s: float = 0.0
     """Maximum by which an interval is longer or shorter than `interval_s`."""
     timer: bool = False
@@ -29,7 +32,7 @@ class CarTraits(Struct, frozen=True):
     last_frame_wins: bool = False
     """True if only the last of several whole frames in the buffer counts. Then a `$` restarts the string."""
     silent_modes: frozenset[Mode] = frozenset()
-    """Modes in which this car prints nothing, although the vendor's program prints there."""
+    """Modes in which this car prints nothing, besides those in which the vendor's Arduino program prints nothing."""
     text: bool = False
     """True if the car prints the line `EXEC:F` after each general frame."""
     readings: bool = True

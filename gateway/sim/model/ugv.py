@@ -91,7 +91,8 @@ class UgvCar:
 
     The options are:
 
-    - `mission`: the boot mission drives for 2 s.
+    - `mission`: after each reset, the boot mission drives for 2 s. A closed speed loop does not run meanwhile, so a car
+      that has one after a reset (the ROS firmware) stands, and obeys nothing.
     - `no_encoder`: the left encoder counts nothing, as with a loose wire.
     - `quiet`: `T:605` is 0, so the car does not repeat the lines that it gets.
     - `arm`: the boot mission says that there is an arm. Its position then overwrites fields of the same name in the
@@ -305,7 +306,7 @@ class UgvCar:
         self._move(now)
 
     def _run_mission(self, now: float) -> None:
-        """Play the boot mission, each step at its time. A byte on the UART ends it.
+        """Play the boot mission, each step at its time. A byte on the UART ends it when the next step is due.
 
         With an open loop, a step sets the duty at once.
         """

@@ -40,7 +40,7 @@ _TOLERANCE_M: Final = 1e-9
 _START_GRID_M: Final = 0.4
 """Distance between the start places that the world chooses for cars without one in the world file."""
 _START_REACH_M: Final = 4.0
-"""Maximum distance from the middle of a start place that the world chooses, if there are no walls."""
+"""Maximum of |x| and |y| of a start place of the grid, if there are no walls."""
 
 
 class WorldBody(Protocol):
@@ -83,7 +83,7 @@ class World:
         self.cars_meet = cars_meet
         """True if cars see each other and block each other's way."""
         self.lively = cars_meet or bool(self.things) or any(lamp.carried_by for lamp in self.lamps)
-        """True if cars may affect each other, or if something moves by itself."""
+        """True if cars meet, or if the world has things or a carried lamp."""
         self.scheduler = EventScheduler()
         self.bodies: list[WorldBody] = []
         self._starts = dict(starts or {})
@@ -116,7 +116,8 @@ class World:
     def start_pose(self, index: int, name: str = "") -> Pose:
         """Return the start pose of a car: its own from the world file, or a place on the line that depends on `index`.
 
-        In a lively world, a car without a place of its own starts where there is room.
+        Without a line, this place is on the y axis. In a lively world, a car without a place of its own starts where
+        there is room, if there is such a place.
         """
         if name in self._starts:
             return self._starts[name]
@@ -196,7 +197,7 @@ class World:
         return best
 
     def push_out(self, x: float, y: float) -> Point:
-        """Return the place near x, y at which a car does not overlap a wall."""
+        """Return the place near x, y to which the walls, one after the other, push a car that overlaps them."""
         for wall, (low_x, low_y, high_x, high_y) in self._touching:
             if not (low_x < x < high_x and low_y < y < high_y):
                 continue
@@ -333,7 +334,7 @@ class World:
     def clear(self, a: Point, b: Point, without: Iterable[str] = (), *, now: float = 0.0) -> bool:
         """Return True if nothing stands between two points. The result does not depend on their order.
 
-        `without` has the names of cars and things to ignore.
+        `without` has the names of cars and things to ignore, with what they carry.
         """
         a, b = sorted((a, b))
         sight: Segment = (*a, *b)

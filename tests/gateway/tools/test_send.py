@@ -26,7 +26,7 @@ def test_car_drives_until_it_is_stopped_as_it_says(simulate: Callable[..., Any],
     assert done.stdout.splitlines() == [
         f"sent {RUN} to {link}",
         "cars do not answer; `gateway monitor` shows what the car sends",
-        "it drives (forward) until the next command, even without a link",
+        "in mode 0 it drives (forward) until the next command, even without a link",
         f"stop it: gateway send --link {link} '{STOP}'",
         f"     or: gateway send --link {link} '$4WD,MODE00#', which works in every mode, but not on a Raspberry Pi car",
     ]
