@@ -1,7 +1,7 @@
 #!/bin/sh
 # Makes a Raspberry Pi (or another Debian computer) the computer of one or more cars: their gateways start with it.
 #
-#   sudo deploy/install-car.sh --car red --link /dev/ttyUSB0 --platform arduino
+#   sudo deploy/install-car.sh --clone --car red --link /dev/ttyUSB0 --platform arduino
 #
 # It asks for nothing, and may be run again, also to upgrade. `--help` has the options. What it makes:
 #
@@ -43,8 +43,9 @@ usage: install-car.sh [--car NAME --link LINK [--platform P] [--options TEXT]] [
   --options TEXT    more options of `gateway run`
   --ble             also what Bluetooth links need
   --all             also hub, recorder, console, exporter, ...: for the computer of the hub
-  --wheel FILE      install this file (default: the newest version from PyPI)
-  --clone           install the clone that this script is in
+  --wheel FILE      install this file
+  --clone           install the clone that this script is in. Without --clone and --wheel, the newest version comes from
+                    PyPI, but none is published there yet
   --uninstall       remove what this script has made, apart from files that were changed since
   --prefix DIR      put everything below DIR, and start nothing (for tests)
 END

@@ -118,7 +118,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed",
         type=int,
         default=0,
-        help="seed of everything random: with the same seed and the same bytes, cars behave the same (default: 0)",
+        help="seed of everything random: with the same seed, and the same bytes at the same times, cars behave the same "
+        "(default: 0)",
     )
     parser.add_argument(
         "--world",
