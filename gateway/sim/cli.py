@@ -38,7 +38,8 @@ options of a platform that real cars have, too; join several with + (--car red:a
   +3s                                   the battery has three cells: up to 12.6 V
   +fan_level                            the fan digit is a level: 0 turns the fan off in every frame
   +ptz_direct                           the servo goes to the angle in the frame, not to 180 degrees minus the angle
-  +head=WORD                            frames begin with WORD instead of 4WD: 2 to 8 letters and digits
+  +head=WORD                            readings and named frames begin with WORD instead of 4WD: 2 to 8 letters and
+                                        digits
 options of the simulator only:
   +interval=S                           the time from report to report is S seconds (0.1 to 10)
   +spread=S                             each time from report to report is up to S seconds longer or shorter (0 to 1)
@@ -85,8 +86,7 @@ until the mode is closed. The buttons are forward, back, left, right, spin_left,
 slower.
   --ir red:forward@5                    on stdin {"car": "red", "ir": "forward"}
 A world from a file can have lamps that light sensors see, things to bump into and to follow, and cars that see each
-other and block each other's way. `fleet example copy follow` writes such a file with a comment for each field. On
-stdin:
+other and block each other's way. `fleet example copy follow` writes such a file with comments. On stdin:
   {"lamp": "beacon", "on": false}       or "brightness", "reach_m", "x_m", "y_m" (for a lamp on a car: ahead, left)
   {"thing": "cart", "x_m": 1, "y_m": 0} puts it there, off its path; or "speed_m_s": its speed along its path
 The true state, on stdin:
@@ -118,8 +118,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed",
         type=int,
         default=0,
-        help="seed of everything random: with the same seed, and the same bytes at the same times, cars behave the same "
-        "(default: 0)",
+        help="seed of everything random: with the same seed, and the same bytes at the same times, cars behave the "
+        "same (default: 0)",
     )
     parser.add_argument(
         "--world",

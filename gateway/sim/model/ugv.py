@@ -46,7 +46,7 @@ WIFI_S: Final = 15.0
 SERVO_SEARCH_S: Final = 0.1
 """Time for which the car waits for a servo that does not answer."""
 PAGE_OPEN_S: Final = 10.0
-"""Time from the last press until the page is closed and its queries end."""
+"""Time from the last press until the queries of the page end. The command of the button is repeated after that, too."""
 KP: Final = 20.0
 KI_PER_TURN: Final = 200.0
 """Integral gain per step of the speed loop. A step takes SPEED_LOOP_S."""
