@@ -13,6 +13,7 @@ from gateway.sim.car_spec import CarSpec, PtyPath, ReplaySpec
 from gateway.sim.endpoints import EndpointError, PtyEndpoint, SimEndpoint, TcpEndpoint
 from gateway.sim.faults import Fault, FaultKind, Press, targets
 from gateway.sim.model.capture_car import CaptureCar
+from gateway.sim.model.course import CourseCar
 from gateway.sim.model.factory import build, build_ugv
 from gateway.sim.model.faulty_link import Direction, FaultyLink
 from gateway.sim.model.firmware_base import Firmware, Pose, Truth
@@ -70,6 +71,7 @@ class SimCar:
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._held = False
+        self._is_off = False
         self._dropped = False
         self._restore: asyncio.TimerHandle | None = None
         self._unstick: asyncio.TimerHandle | None = None
@@ -213,7 +215,11 @@ class SimCar:
 
     def press(self, button: Button) -> bool:
         """Press a button of the infrared remote; return True if the car obeys it."""
-        obeyed = isinstance(self.firmware, Firmware | UgvCar) and self.firmware.press(button, self._loop.time())
+        obeyed = (
+            not self._is_off
+            and isinstance(self.firmware, Firmware | UgvCar)
+            and self.firmware.press(button, self._loop.time())
+        )
         self._pump()
         return obeyed
 
@@ -262,13 +268,18 @@ class SimCar:
         self._pump()
 
     async def _go_out(self) -> None:
-        """Switch the car off, because its battery is empty. Its link is gone until somebody ends `link_drop`."""
-        if isinstance(self.firmware, Firmware | UgvCar):
+        """Switch the car off, because its battery is empty, until somebody ends `link_drop`. Its link is gone, too."""
+        self._is_off = True
+        if isinstance(self.firmware, UgvCar):
+            self.firmware.switch_off(self._loop.time())
+        elif isinstance(self.firmware, Firmware):
             self.firmware.brown_out(self._loop.time())
         await self._drop(None)
 
     async def _brown_out(self) -> None:
-        if isinstance(self.firmware, RaspberryPiCar) and isinstance(self._link, TcpEndpoint):
+        if self._is_off:
+            return
+        if isinstance(self.firmware, RaspberryPiCar | CourseCar) and isinstance(self._link, TcpEndpoint):
             # The whole machine goes down with its sockets, before the program starts without a client.
             await self._drop(PI_BOOT_S)
         if isinstance(self.firmware, Firmware | UgvCar):
@@ -298,10 +309,15 @@ class SimCar:
             self._restore = self._loop.call_later(for_s, lambda: self._later(self._bring_back()))
 
     async def _bring_back(self) -> None:
+        self._faults.mend()  # a cut that still waits for its frame is called off
         self._pump()
         if not self._dropped:
             return
         self._dropped = False
+        if self._is_off:
+            self._is_off = False
+            if isinstance(self.firmware, UgvCar):
+                self.firmware.brown_out(self._loop.time())
         if self._restore is not None:
             self._restore.cancel()
             self._restore = None

@@ -46,7 +46,7 @@ WIFI_S: Final = 15.0
 SERVO_SEARCH_S: Final = 0.1
 """Time for which the car waits for a servo that does not answer."""
 PAGE_OPEN_S: Final = 10.0
-"""Time from the last press until the queries of the page end. The command of the button is repeated after that, too."""
+"""Minimum time for which the page stays open after a press. It is open for as long as it repeats a command."""
 KP: Final = 20.0
 KI_PER_TURN: Final = 200.0
 """Integral gain per step of the speed loop. A step takes SPEED_LOOP_S."""
@@ -199,10 +199,16 @@ class UgvCar:
         self._run(now)
         self._reset(now, text=True)
 
+    def switch_off(self, now: float) -> None:
+        """Switch the car off until the next `brown_out`. It rolls to a stop, and does and sends nothing."""
+        self._run(now)
+        self._reset(now, text=False)
+        self._boot_until, self._mission = inf, []
+
     def press(self, button: Button, now: float) -> bool:
         """Press a button of the car's own web page; return True if the page has that button.
 
-        The page repeats the command until the next button or a reset.
+        The page repeats the command until the next button or a reset, and is open for that time.
         """
         self._run(now)
         if button not in SIGNS:
@@ -331,7 +337,7 @@ class UgvCar:
             self._page_at = now + PAGE_S
             self._obey({"T": 1, "L": 0.3 * self._page[0], "R": 0.3 * self._page[1]})
         since, until = self._page_open
-        for interval_s, question in PAGE_ASKS_S if now < until else ():
+        for interval_s, question in PAGE_ASKS_S if now < until or self._page is not None else ():
             if (now - since) % interval_s < LOOP_S:
                 self._obey({"T": question})
 

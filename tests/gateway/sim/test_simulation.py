@@ -25,6 +25,9 @@ from gateway.sim.faults import Fault, FaultKind
 from gateway.sim.model.car_body import CUT_OFF_V
 from gateway.sim.model.faulty_link import Direction
 from gateway.sim.model.firmware_base import Firmware
+from gateway.sim.model.ir_remote import Button
+from gateway.sim.model.raspberry_pi import PI_BOOT_S
+from gateway.sim.model.ugv import UgvCar
 from gateway.sim.simulation import Simulation
 from gateway.sim.truth_publisher import HUB_RETRY_DELAY_S, TruthPublisher
 from schemas.bus import Bus, Sample
@@ -612,3 +615,59 @@ async def test_empty_battery_falls_then_car_and_link_are_off(pair: Simulation) -
     with pytest.raises(ConnectionError):
         await asyncio.open_connection(host, port)
     writer.close()
+
+
+async def test_empty_battery_moves_nothing_until_the_link_is_back(tmp_path: Path) -> None:
+    specs = parse_cars([f"w:wave_rover+mission:pty:{tmp_path / 'w'}"])
+    simulation = Simulation(specs, seed=1)
+    await simulation.start()
+    car = simulation.cars["w"]
+    try:
+        await simulation.inflict(Fault(FaultKind.BROWNOUT, "w"))
+        await until(lambda: car.truth is not None and car.truth.driving, "drives in its boot mission")
+        await simulation.inflict(Fault(FaultKind.EMPTY, "w", for_s=0.0))
+        await until(lambda: car._is_off, "is off")
+        assert not car.press(Button.FORWARD)
+        await simulation.inflict(Fault(FaultKind.BROWNOUT, "w"))
+        assert isinstance(car.firmware, UgvCar)
+        now = asyncio.get_running_loop().time()
+        for second in range(1, 10):
+            car.firmware.advance(now + second)
+            assert not car.firmware.moving or second < 3, "it only rolls to a stop"
+        assert car.firmware.truth.motor_left == 0
+        await simulation.inflict(Fault(FaultKind.LINK_DROP, "w", for_s=0))
+        assert car.press(Button.FORWARD)
+    finally:
+        await simulation.stop()
+
+
+async def test_cut_that_waits_for_its_frame_is_called_off(pair: Simulation) -> None:
+    await pair.inflict(Fault(FaultKind.CUT_WRITE, "green", bytes=3))
+    await pair.inflict(Fault(FaultKind.LINK_DROP, "green", for_s=0))
+    _, _, writer = await driven(pair, "green")
+    writer.close()
+
+
+async def test_brownout_restarts_course_program_with_its_port() -> None:
+    simulation = Simulation(parse_cars(["c:course:tcp"]), seed=1)
+    await simulation.start()
+    try:
+        host, port, writer = await driven(simulation, "c")
+        writer.write(b"$4WD,MODE00#")
+        await until(lambda: not simulation.cars["c"].truth.alive, "dies")
+        await simulation.inflict(Fault(FaultKind.BROWNOUT, "c"))
+
+        async def answers() -> bool:
+            try:
+                _, again = await asyncio.open_connection(host, port)
+            except ConnectionError:
+                return False
+            again.close()
+            return True
+
+        async with asyncio.timeout(PI_BOOT_S + 5.0):
+            while not await answers():  # noqa: ASYNC110 - nothing tells when the port opens
+                await asyncio.sleep(0.05)
+        writer.close()
+    finally:
+        await simulation.stop()
