@@ -10,9 +10,11 @@ DAMAGE: Final = (ValueError, TypeError, KeyError, AttributeError, OverflowError,
 
 
 def write_atomically(path: Path, data: bytes, *, sync: bool = False, private: bool = False) -> None:
-    """Write a file, or replace it and keep its mode. With `sync`, it survives a power failure. Raises OSError.
+    """Write a file, or replace it and keep its mode. Raises OSError.
 
-    With `private`, only the user can read it, also while it is being written.
+    With `sync`, the data is on the disk before the file is replaced, so after a power failure either the old file or
+    the new one is whole. With `private`, only the user can read the file, also while it is being written, and its mode
+    becomes 0600.
     """
     scratch = path.with_name(f".{path.name}.new")
     try:

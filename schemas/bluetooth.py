@@ -9,7 +9,7 @@ SMALL_ADAPTER_CONNECTIONS: Final = 3
 ADAPTER_NOTIFICATIONS_PER_S: Final = 165
 """Notifications per second that an adapter carries (docs/explanation/measurements.md#bluetooth)."""
 # In tracking, a car sends up to 27 reports of 35 bytes a second (docs/reference/protocol.md#rates). A report takes two
-# pieces of 20 bytes, or three if it does not begin with a piece.
+# pieces of 20 bytes, and sometimes three if it does not begin with a piece.
 CAR_NOTIFICATIONS_PER_S: Final = 27 * 3
 """Maximum notifications per second from one car."""
 ADAPTER_FULL: Final = "Bluetooth adapter is full"
@@ -19,4 +19,4 @@ ADAPTER_FULL: Final = "Bluetooth adapter is full"
 def describe_full(adapter: str, connections: int) -> str:
     """Return one line that says that an adapter is full, and what to do."""
     what = f"the {ADAPTER_FULL}: {adapter} has {connections} connections, and most can hold {ADAPTER_CONNECTIONS}"
-    return f"{what}, some {SMALL_ADAPTER_CONNECTIONS}. End this car's link with ?adapter=hci1 or ?adapter=auto"
+    return f"{what}, some {SMALL_ADAPTER_CONNECTIONS}. Add ?adapter=hci1 or ?adapter=auto to this car's link"

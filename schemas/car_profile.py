@@ -67,7 +67,7 @@ class CarProfile(Protocol):
         """Return the names of all readings that the car can send in this mode: `range`, `battery`, `line`, ..."""
 
     def why_lacking(self, capability: str) -> str | None:
-        """Return a sentence on why the car lacks a capability. None if the car, or every car, has the capability."""
+        """Return a sentence on why the car lacks a capability. None if it has it, or if there is no such capability."""
 
     def hint(self, odd: str) -> str:
         """Return the likely cause of something odd in such cars, as a sentence. Empty if the platform has none.

@@ -29,7 +29,7 @@ _OTHER_CAR_COLORS: Final[tuple[Rgb, ...]] = (
 
 
 def parse_color(text: str) -> Rgb:
-    """Return the color of a name or of `#rrggbb`. Raises ValueError for another text."""
+    """Return the color of a name, of `#rrggbb`, or of `rrggbb`. Raises ValueError for another text."""
     if text in COLORS:
         return COLORS[text]
     match = re.fullmatch(r"#?([0-9a-fA-F]{2})([0-9a-fA-F]{2})([0-9a-fA-F]{2})", text)

@@ -24,7 +24,7 @@ def duration_s(text: str) -> float | None:
 
 
 def parse_duration(text: str, min_s: float = 0.0, max_s: float | None = None) -> float:
-    """Return the duration in seconds. Raises ValueError outside the range, and for 0."""
+    """Return the duration in seconds. Raises ValueError outside the range, for 0, and for any other text."""
     seconds = duration_s(text)
     if seconds is None:
         likely = _likely_duration(text) or "it as 500ms, 2s, 1m30s or 1h"

@@ -12,7 +12,7 @@ DEFAULT_MAX_DRIVE_S: Final = 10.0
 """Maximum duration of a drive, unless `gateway run --longest-drive` sets another."""
 MAX_QUEUE_TIME_S: Final = 15.0
 """Maximum time that a command waits for a busy car. It is longer than the longest stop, which is the one after
-connecting to a car that sends nothing (`stop_in_progress.RECOVERY_WORST_S`, and a turn of obstacle avoidance)."""
+connecting to a car that sends nothing (`stop_choice.RECOVERY_WORST_S`, and a turn of obstacle avoidance)."""
 MAX_EVIDENCE_TIMEOUT_S: Final = 18.0
 """Maximum time for the evidence of a stop, in addition to its announced worst case: four intervals of the slowest car,
 which reports every 3 s, with the longest `MODE00` (`stop_in_progress.SLOWEST_S`). A car with an interval of 2.5 s or

@@ -32,7 +32,8 @@ _BLE_NAME_BYTES: Final = 248
 """Maximum length of the name of a Bluetooth device."""
 
 PortKey = tuple[str, str, frozenset[tuple[str, str]]]
-"""Equal for two links that open the same port: the kind of link, the device or host in one normal form, and the ids."""
+"""The kind of link, the device or host in one normal form, and the ids. Links with equal keys name the same port. But
+one port may have several keys: a USB device has one for its path, and others for its ids."""
 
 
 class BadLink(ValueError):
@@ -40,7 +41,7 @@ class BadLink(ValueError):
 
 
 class Look(Protocol):
-    """Looks for the device or host of a link. Opens no link. Each method returns True if all is well, and a text."""
+    """Looks for the device or host of a link. Each method returns True if all is well, and a text."""
 
     def device(self, path: str) -> tuple[bool, str]:
         """Look at a serial port."""
@@ -49,7 +50,7 @@ class Look(Protocol):
         """Look for a USB device."""
 
     def host(self, host: str, port: int) -> tuple[bool, str]:
-        """Look for a host. Do not connect to a port where that could harm a car."""
+        """Look for a host. Connect to its port only where that cannot harm a car."""
 
 
 # Plain classes: dataclasses, and what they import, took a fifth of the time until a gateway is on the bus.
@@ -97,7 +98,7 @@ class LinkUrl(ABC):
         """The port that the link names. Symlinks are followed."""
 
     def possible_ports(self) -> Iterator[PortKey]:
-        """Yield the keys of all links that may name the port of this one."""
+        """Yield the key of this link, and those of vaguer links that may name its port (see `UsbUrl`)."""
         yield self.port_key
 
     def without_options(self) -> "LinkUrl":
@@ -261,10 +262,10 @@ class TcpUrl(LinkUrl):
             raise BadLink(str(error)) from None
         if not parts.hostname or not port:
             if parts.hostname and not parts.netloc.rpartition("]")[2].count(":"):
-                raise BadLink(f"the port is missing. Write tcp://{parts.hostname}:{CAR_TCP_PORT}")
+                raise BadLink(f"the port is missing. Write {TcpUrl(parts.hostname, CAR_TCP_PORT)}")
             raise BadLink(f"it needs a host and a port from 1 to 65535. Write tcp://192.168.1.7:{CAR_TCP_PORT}")
         if parts.path or parts.query or parts.fragment or parts.username is not None:
-            raise BadLink("nothing may follow the port")
+            raise BadLink("nothing may follow the port, and no user name may stand before the host")
         return TcpUrl(parts.hostname, port)
 
     @classmethod
@@ -398,7 +399,7 @@ def _serial(netloc: str, path: str, query: str) -> SerialUrl | UsbUrl:
         if netloc and path.strip("/"):
             raise BadLink("write three slashes before a device path")
         if netloc and not _WINDOWS_PORT.fullmatch(netloc):
-            raise BadLink("it names no device")
+            raise BadLink(f"it names no device. Write the whole path, such as serial:///dev/{netloc}")
         if options:
             ids = ", ".join(name for name in _USB_FIELDS if name in options)
             raise BadLink(f"it names both a device path and {ids}: write only one of the two")

@@ -135,7 +135,8 @@ class People(Struct, frozen=True):
     def may_end(self, sender: Sender, by: str, rank: Rank) -> bool:
         """Return True if this sender may end what `by` of this rank began.
 
-        What a lead began, only a lead may end, as long as the table names one.
+        What a lead began, only a lead may end, as long as the table names one. Without a table, also the person who
+        began it may.
         """
         if rank is not Rank.LEAD or sender.kind is Rank.LEAD:
             return True
@@ -378,6 +379,7 @@ class Authority(Struct, frozen=True):
         """Return None if the sender may end at least one of the things that a resume names, else why not.
 
         The resume names the e-stops `ids`, or without ids the hold. With `every`, it names the hold and all e-stops.
+        If none of `ids` is in force, there is nothing to deny.
         """
         hold = self.denies(sender, Right.RESUME)
         if sender.kind is Rank.COORDINATOR:

@@ -1,4 +1,4 @@
-"""Lists the cars that have a gateway on this computer, by locks in the state directory, so it needs no hub."""
+"""Lists the cars whose gateways this user runs here, by locks in the state directory, so it needs no hub."""
 
 from collections.abc import Iterator
 from contextlib import suppress

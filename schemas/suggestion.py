@@ -1,8 +1,8 @@
 """Suggests to users what to type instead: the name that was meant, or how to install an extra. Pure.
 
-A name is near a word if few letters differ, if the name or a part of it begins with the word, or if the word begins
-with the whole name, such as `tracking mode`. A name that is only somewhat like the word is never suggested: whoever
-types `parking` does not mean `tracking`.
+A name is near a word if few letters differ, or if the name or a part of it begins with the word. A name of letters and
+digits only is also near a word that begins with the whole name, such as `tracking mode`. A name that is only somewhat
+like the word is never suggested: whoever types `parking` does not mean `tracking`.
 """
 
 import re

@@ -11,7 +11,7 @@ from schemas.suggestion import nearest
 from schemas.words import UNKNOWN, Basis, BatteryLevel, LinkState, Mode, Motion, MotionSource, Motors, Verdict
 
 PROTOBUF: Final = "application/protobuf"
-HISTORY: Final = 1500  # docs/reference/keys.md#topics: one minute of the fastest readings
+HISTORY: Final = 1500  # docs/reference/keys.md#topics: about one minute of the fastest readings
 # A hub or a recorder that restarts is back after two or three seconds.
 CACHE_S: Final = 10.0
 """Time for which a publisher keeps its publications for backfill."""
@@ -21,7 +21,8 @@ _MIN_CACHE_SIZE: Final = 100  # events and states come in bursts
 class Qos(StrEnum):
     """The quality of service of a publication. `bus.publisher` maps it to Zenoh's options."""
 
-    # Under congestion, Zenoh drops publications and never blocks: one stalled subscriber must not freeze a gateway.
+    # Under congestion, Zenoh drops readings and states: one stalled subscriber must not freeze a gateway. Only the
+    # sender of a command waits.
     READING = "reading"  # batched
     STATE = "state"  # overtakes readings
     COMMAND = "command"  # overtakes everything, sent at once
@@ -36,7 +37,7 @@ class Topic(NamedTuple):
     about: str
     qos: Qos
     rate_hz: float = 0.0
-    """Maximum expected rate. 0 for events."""
+    """Maximum expected rate. 0 if there is none, as for events and sent frames."""
     stale_after_s: float | None = None
     """Age at which a value is stale. None if it never expires."""
     units: Mapping[str, str] = MappingProxyType({})

@@ -1,8 +1,8 @@
 """The closed sets of words: the values of fields, parts of keys and entries of files that allow only a few. Pure.
 
-A word has the same spelling in messages, files, commands and code. How a word is written on a car's wire is in
-`gateway.drivers.yahboom.protocol`. Messages hold words as text, so another version's word never breaks a reader. The
-verbs are in `commands`, each with its properties.
+A word has the same spelling in messages, files, commands and code. How a word is written on a car's wire is in its
+driver, below `gateway.drivers`. Messages hold words as text, so another version's word never breaks a reader. The verbs
+of cars are in `commands`, each with its properties.
 """
 
 from enum import StrEnum
@@ -34,7 +34,11 @@ class Motion(StrEnum):
 
 
 class Mode(StrEnum):
-    """A mode of the car's program. In `MANUAL` the car is driven; in the others it moves by itself or only shines."""
+    """A mode of the car's program.
+
+    In `manual` commands drive the car, in `remote_control` only its infrared remote does, in `color_led` it only
+    shines, and in the others it moves by itself.
+    """
 
     MANUAL = "manual"
     REMOTE_CONTROL = "remote_control"
@@ -133,7 +137,8 @@ CAPABILITIES: Final = (
     *("mode", "led", "servo_deg", "arm", "servo_vertical", "servo_horizontal"),
     *("drive", "whistle", "speed", "servo", "fan", "light"),
 )
-"""The capabilities of cars, as `state/health` lists them. Those that some cars lack come first."""
+"""The capabilities of cars that a person uses; `state/health` lists others, too, such as `imu`. Those that only some of
+Yahboom's cars have come first."""
 
 
 class Rank(StrEnum):

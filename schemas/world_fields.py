@@ -120,7 +120,7 @@ class WorldEntry(Entry):
     cars: dict[_Name, StartEntry] = Field(
         default_factory=dict,
         max_length=_MAX_ITEMS,
-        description="where each car begins; a car that is not listed begins on the line",
+        description="where each car begins; a car that is not listed begins on the line, if there is one",
     )
     lamps: dict[_Name, LampEntry] = Field(
         default_factory=dict, max_length=_MAX_ITEMS, description="lamps that light sensors see"
