@@ -1,6 +1,6 @@
 """Reads the dates of a certificate without a library of cryptography, which each command would have to load. Pure.
 
-Nothing is checked here, so use it only for certificates in our own directory, which we made.
+Nothing is checked here. So trust the result only for certificates in our own directory, or check the certificate then.
 """
 
 import binascii

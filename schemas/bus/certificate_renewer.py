@@ -15,7 +15,7 @@ from schemas.bus.credentials import Credentials
 from schemas.bus.errors import BusError
 
 CHECK_INTERVAL: Final = timedelta(minutes=10)
-"""Interval at which a program looks at its certificate, and at which it repeats a failed renewal."""
+"""Maximum interval at which a program looks at its certificate, and at which it repeats a failed renewal."""
 SHORTEST_CHECK_INTERVAL: Final = timedelta(seconds=1)
 SHARE_OF_A_CHECK: Final = 0.1
 """Interval of the checks as a share of the time that the certificate has left, if that is shorter than

@@ -35,7 +35,7 @@ SITE: Final = "site"
 
 
 class NoCredentials(BusError):
-    """This computer has no certificate for a hub. The text says how to get one."""
+    """This computer has no certificate, or no rules, for a hub. The text says how to get them."""
 
 
 class Credentials(NamedTuple):
@@ -65,7 +65,8 @@ class Credentials(NamedTuple):
     def identity(self, wanted: str = "") -> str:
         """Return the wanted identity, by default that of the user, if its certificate is here. Raises NoCredentials.
 
-        Never use another certificate instead: the hub would drop the messages of such a gateway without an error.
+        Only the services of AS_THE_USER may use the certificate of the user instead. For any other, never use another
+        certificate: the hub would drop the messages of such a gateway without an error.
         """
         names = (wanted, self.me) if wanted in AS_THE_USER else (wanted or self.me,)
         for name in names:
@@ -148,7 +149,7 @@ class Credentials(NamedTuple):
 
     @property
     def first_hubs(self) -> list[str]:
-        """Return the endpoints of the first hub, to which this site's hub links. Empty if this is the first hub."""
+        """Return the endpoints of the first hub, to which this site's hub links. Empty if this is no hub of a site."""
         try:
             return list(self.hub_settings()[CONNECT])
         except NoCredentials:
@@ -156,7 +157,7 @@ class Credentials(NamedTuple):
 
     @property
     def site(self) -> str:
-        """Return the name of the site whose hub this computer is. Empty for the first hub."""
+        """Return the name of the site whose hub this computer is. Empty if it is no hub of a site."""
         try:
             return str(self.hub_settings()[SITE])
         except NoCredentials:

@@ -1,8 +1,8 @@
-"""Errors of the bus. Each text names the endpoint and what to do."""
+"""Errors of the bus. Each text says what is wrong, and most say what to do."""
 
 
 class BusError(Exception):
-    """The bus is not available. The text names the endpoint and what to do."""
+    """The bus is not available, or a file of its hub cannot be used. The text says why."""
 
 
 class NoFleet(BusError):

@@ -1,4 +1,4 @@
-"""The hub: a Zenoh router on loopback in its own process, which exits when it has no links.
+"""The hub: a Zenoh router in its own process. By default it listens on loopback, and exits 10 s after its last client.
 
 The listening port is the mutex: a second hub on the same port fails at once. `bus.ensure_hub` starts a hub; you can
 start one by hand: `python -m schemas.bus.hub --endpoint tcp/127.0.0.1:7447`.
@@ -25,7 +25,7 @@ from schemas.process import signals
 from schemas.process.panic_watch import PanicWatch
 
 IDLE_S: Final = 10.0
-"""Time without a link after which the hub exits."""
+"""Time without a client after which the hub exits. A linked hub of another site is not a client."""
 _POLL_S: Final = 0.5
 RULES_POLL_S: Final = 2.0
 """Interval at which the hub of another site asks for the rules."""
@@ -33,9 +33,10 @@ RULES_TIMEOUT_S: Final = 1.0
 
 
 def serve(endpoint: str, idle_s: float, stop: threading.Event) -> None:
-    """Route until `stop` is set or there was no link for `idle_s`. Raises zenoh.ZError if the port is in use, BusError.
+    """Route until `stop` is set or there was no client for `idle_s`.
 
-    When the rules of a hub change, it opens a new session, because Zenoh reads rules only then. Clients reconnect soon.
+    When the rules or the certificate of a hub change, it opens a new session, because Zenoh reads them only then.
+    Clients reconnect soon. Raises zenoh.ZError if the port is in use, BusError.
     """
     last_link = time.monotonic()
     links = HubLinks(Credentials.of(endpoint)) if is_secure(endpoint) else None
@@ -65,7 +66,7 @@ def _has_clients(session: zenoh.Session) -> bool:
 
 
 def _answer_sites(links: HubLinks, session: zenoh.Session) -> None:
-    """Answer the hubs of other sites with their rules, and store the links that they send, until the session ends."""
+    """Answer the hubs of other sites with their rules, and keep the links that they send, until the session ends."""
     if not (rules := links.credentials.hub_settings()[OF_SITES]):
         return
     payload = json.dumps(rules)
@@ -112,9 +113,11 @@ def main() -> int:
     """Run a hub. Return 0 at its regular end, 1 if it could not listen, 2 for wrong use."""
     parser = argparse.ArgumentParser(prog="python -m schemas.bus.hub", description=__doc__)
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
-    parser.add_argument("--idle-s", type=float, default=IDLE_S, help="end after this time without a link (default 10)")
     parser.add_argument(
-        "--insecure-lan", action="store_true", help="listen on a network, where everyone may drive the cars"
+        "--idle-s", type=float, default=IDLE_S, help="end after this time without a client (default 10)"
+    )
+    parser.add_argument(
+        "--insecure-lan", action="store_true", help="listen on a network, where everyone can drive the cars"
     )
     arguments = parser.parse_args()
     try:

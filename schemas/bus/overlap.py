@@ -35,7 +35,7 @@ class Overlap:
     def is_twin(self, what: Hashable, now: float, *, newer: bool, within_s: float = inf) -> bool:
         """Return True if the same message has come over the other session at most `within_s` ago.
 
-        With `newer`, this message came over the newer session.
+        With `newer`, this message came over the newer session. Otherwise also return True if `older_is_deaf`.
         """
         with self._lock:
             if self.older_is_deaf and not newer:

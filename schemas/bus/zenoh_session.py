@@ -1,4 +1,4 @@
-"""The only place that opens a Zenoh session: publications, subscriptions, queries and liveliness tokens.
+"""The only place that opens a Zenoh session, except the hub: publications, subscriptions, queries, liveliness tokens.
 
 A queryable answers the queries for its keys. A liveliness token is a key that others can see while its session is
 connected. A watch reports which tokens appear and disappear.
@@ -58,7 +58,8 @@ OVERLAP_S: Final = 0.5
 sites know the second one, too. Then the first one is kept for the same time again, for messages that are still on their
 way."""
 ANSWERS_S: Final = 12.0
-"""Time for which the first session stays open for late answers. No query waits for longer than 10 s."""
+"""Time for which the first session stays open for late answers. Except to a recorder, no query waits longer than
+10 s."""
 RECALL_TIMEOUT_S: Final = 5.0
 """Timeout for what publishers have cached. A publisher on a bad network takes seconds."""
 REOPEN_TIMEOUT_S: Final = 5.0
@@ -107,8 +108,9 @@ class Bus:
     ) -> Self:
         """Open a session at the endpoint (see `resolve_endpoint`).
 
-        With `start_hub`, start a hub if there is none. Without it, raise NoFleet if there is no hub on this computer,
-        or HubUnreachable if the endpoint is on another computer and no hub answers there.
+        With `start_hub`, start a hub if the endpoint is on this computer and there is none. Without it, raise NoFleet
+        then. If the endpoint is on another computer and no hub answers there, raise HubUnreachable. Raises BadEndpoint,
+        and BusError if what answers is no hub, or refuses this session.
 
         `identity` is the owner of the certificate to use, such as `car.red`; by default it is the user. It matters only
         to a hub with certificates. Raises NoCredentials if this computer has no such certificate.

@@ -14,8 +14,8 @@ FEEDS_PER_WATCHDOG: Final = 4
 """Number of messages within the watchdog's timeout. systemd asks for two. With four, one turn of the loop may take
 three quarters of the timeout."""
 READY_RETRY_S: Final = 1.0
-"""Delay before a message that could not be sent is repeated. Without `READY=1`, systemd ends the service after its
-TimeoutStartSec (90 s)."""
+"""Maximum delay before a message that could not be sent is repeated. Without `READY=1`, systemd ends the service after
+its TimeoutStartSec (90 s)."""
 
 
 class ServiceNotifier:
@@ -25,7 +25,7 @@ class ServiceNotifier:
         self._socket: socket.socket | None = None
         self._interval_s = inf
         self.due_at = inf
-        """When `feed` has to be called next. Infinite if there is no systemd to notify."""
+        """When `feed` has to be called next. Infinite if there is nothing to tell systemd."""
         address = environment.get(NOTIFY_SOCKET, "")
         if not address.startswith(("/", "@")) or not hasattr(socket, "AF_UNIX"):
             return

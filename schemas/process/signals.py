@@ -71,7 +71,7 @@ def _in_loop() -> bool:
 
 @contextmanager
 def taken_as_ctrl_c(interrupt: Callable[[], object]) -> Iterator[None]:
-    """Call `interrupt` on each of the signals during a block, in the main thread. SIGINT raises KeyboardInterrupt."""
+    """During a block in the main thread, let SIGINT raise KeyboardInterrupt, and each other signal call `interrupt`."""
     # A shell starts background processes with SIGINT ignored, and Python leaves it so. Here, handle SIGINT anyway.
     others = [number for number in signals() if number is not signal.SIGINT]
     ignored = [signal.SIGINT] if signal.getsignal(signal.SIGINT) is signal.SIG_IGN else []

@@ -58,7 +58,10 @@ class Problem(Struct, frozen=True, order=True):
 
 
 class BadFile(ValueError):
-    """A file that cannot be used; the text has one line per fault: `file:line:column: error: field: what`."""
+    """A file that cannot be used. The text has one line for each of the first 50 faults.
+
+    Such a line is `file:line:column: error: field: what`.
+    """
 
     def __init__(self, source: str, problems: Iterable[Problem]) -> None:
         self.source = source
@@ -116,7 +119,10 @@ def _suggest_file(path: Path) -> str:
 
 
 def read_text(path: Path, source: str | None = None) -> str:
-    """Read the text of a file. Raises BadFile if it cannot be read, is too large, or is not UTF-8."""
+    """Read the text of a file. Raises BadFile if it cannot be read, or is not UTF-8.
+
+    Of a file that is too large, return only the beginning: one byte more than `Document` accepts.
+    """
     source = str(path) if source is None else source
     try:
         kind = name_special_file(path)
@@ -149,7 +155,8 @@ def _read_start(path: Path) -> bytes:
 class Document:
     """A YAML text as plain data with the place of each value, and the faults found so far.
 
-    Raises BadFile at once if the text is not YAML. `tree` is the data, with None for each faulty value.
+    Raises BadFile at once if the text is not YAML, empty or too large. `tree` is the data, with None for each value
+    that YAML alone shows to be faulty.
     """
 
     def __init__(self, text: str, source: str) -> None:
