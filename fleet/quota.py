@@ -10,8 +10,8 @@ from typing import Final
 from msgspec import Struct
 
 SESSIONS_PER_QUOTA: Final = 10
-"""Minimum number of sessions that fit into a quota. Nothing of the session that is being written may be removed, so
-each session is at most a tenth of the quota."""
+"""Number of sessions that fit into a quota, if no size of a session is set. Nothing of the session that is being
+written may be removed, so each session is at most a tenth of the quota."""
 QUOTA_SEGMENT_S: Final = 60.0
 """Length of a segment, s, if there is a quota. Whole segments are removed for the quota, and a pin keeps whole
 minutes."""

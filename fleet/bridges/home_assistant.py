@@ -9,7 +9,8 @@ shows as unknown. States are not retained: a client that connects gets the next 
 yesterday's. An entity expires after EXPIRE_S without a state, so a bridge that hangs leaves no old value on the screen.
 Availability is retained, because Home Assistant reads it when it starts. It is `offline` for a car whose gateway has
 gone or is silent, or whose link is lost. The bridge has an availability of its own, which the broker sets to `offline`
-if the bridge's connection breaks (the bridge's last will). An entity is available only if the car and the bridge are.
+if the bridge's connection breaks (the bridge's last will). An entity is available only if the car and the bridge are;
+for the connection, the bridge is enough.
 
 **After a crash,** the broker still has what the bridge had retained: the announcements, and `online` for its cars. The
 next bridge reads what is kept as availability when it begins (`adopt`), and publishes `offline` for cars that are not

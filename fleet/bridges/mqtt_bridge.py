@@ -28,7 +28,7 @@ from schemas.process import signals
 PLAIN_PORT: Final = 1883
 TLS_PORT: Final = 8883
 _WAIT_S: Final = 0.25
-"""Maximum time until a change, or a signal to end, is noticed."""
+"""Maximum time until a change is noticed."""
 _TOPICS: Final = ("state/*", "sensor/battery", "sensor/range")
 _BROKER_TIMEOUT_S: Final = 5.0
 """Timeout of each exchange with the broker. After it, the connection is opened again."""
@@ -85,7 +85,11 @@ class MqttBridge:
         self._notify = notify
 
     async def run(self) -> None:
-        """Publish until a signal ends the process. Raises BrokerRefused, but only for the first connection."""
+        """Publish until a signal ends the process.
+
+        Raises BrokerRefused, but only at the first attempt to connect. Later, a refusal is taken for a broker that is
+        away.
+        """
         ended = asyncio.Event()
         signals.calls_in(asyncio.get_running_loop(), lambda _: ended.set())
         with ThreadPoolExecutor(max_workers=4) as pool:

@@ -67,7 +67,7 @@ def parse(
     tree = Expression(_Parser(text, names, aliases, functions).parse_all())
     if len(str(tree)) > MAX_CONDITION_LENGTH:
         raise BadExpression(
-            text, 1, f"it is too long when its numbers are written out: allowed are {MAX_CONDITION_LENGTH} characters"
+            text, 1, f"it is too long in its normal form: allowed are {MAX_CONDITION_LENGTH} characters"
         )
     return tree
 

@@ -16,7 +16,7 @@ _TYPES: Final[Mapping[int, type]] = {
 }
 """Types of fields by protobuf's C++ type. All other types except messages are numbers."""
 LAST: Final = ("car", "seq", "boot_id")
-"""Fields of every message but logs. They are the last ones in lists of names."""
+"""Fields of every published message but logs. They are the last ones in lists of names."""
 
 OWNERS: Final = frozenset({"by", "holder", "owner", "sender"})
 """Fields with a sender: a person, or a person's process (`mia@laptop-4711`)."""

@@ -95,9 +95,10 @@ class PinRule(Struct, frozen=True):
 class FleetFile(Struct, frozen=True):
     """A fleet file with resolved cars and absolute paths.
 
-    endpoint: the bus, or None for FLEET_ENDPOINT or loopback. quota: maximum size of the recordings. console_port: the
-    port of the web page, 0 for the default. groups: cars by group. people: the only people who may drive, or None if
-    everyone may. unlinked: cars without a link, if they are allowed. pins: the times that are pinned in recordings.
+    endpoint: the bus, or None for the default of `bus.resolve_endpoint`. quota: maximum size of the recordings.
+    console_port: the port of the web page, 0 for the default. groups: cars by group. people: the only people who may
+    drive, or None if everyone may. unlinked: cars without a link, if they are allowed. pins: the times that are pinned
+    in recordings.
     """
 
     name: str

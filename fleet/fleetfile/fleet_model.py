@@ -170,7 +170,8 @@ class CommonEntry(Entry):
     )
     color: _Color = Field(
         default_factory=str,
-        description='color in tables and pictures: red, or "#e01b24" in quotes; left out: the color in the car\'s name',
+        description='color in tables and pictures: red, or "#e01b24" in quotes; left out: the color that the car is '
+        "named after, else one of six",
     )
     without: list[Capability] = Field(
         default_factory=list,
@@ -245,7 +246,8 @@ class FileEntry(Entry):
     )
     endpoint: Annotated[str, AfterValidator(validate_endpoint)] = Field(
         default_factory=str,
-        description="address of the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, or else a hub on this computer",
+        description="address of the bus, tcp/HOST:PORT; left out: FLEET_ENDPOINT, else the hub that you have joined, "
+        "else a hub on this computer",
     )
     plan: _Path = Field(default_factory=str, description="the file with the plan: what the cars do together")
     record: bool | RecordEntry = Field(

@@ -28,9 +28,10 @@ if TYPE_CHECKING:
     from serial.tools.list_ports_common import ListPortInfo
 
 HOST_TIMEOUT_S: Final = 3.0
-"""Timeout for the reply of a host."""
+"""Timeout for the reply of a host, for each of its addresses."""
 CLOSED_PORT: Final = 9
-"""A TCP port at which no host listens (discard). A reachable host refuses a connection to it at once."""
+"""A TCP port at which hardly any host listens (discard). A reachable host without a firewall refuses a connection to it
+at once."""
 
 
 class LinkCheck(Struct, frozen=True):
@@ -43,7 +44,10 @@ class LinkCheck(Struct, frozen=True):
 
 
 def check_link(car: FleetCar, running_links: Mapping[str, tuple[str, str, str]]) -> LinkCheck:
-    """Check a car's link within HOST_TIMEOUT_S. `running_links`: state, reason and URL, by the car of each gateway."""
+    """Check a car's link, which may take HOST_TIMEOUT_S and more for a host that does not answer.
+
+    `running_links`: state, reason and URL, by the car of each gateway.
+    """
     if car.name in running_links:
         state, reason, url = running_links[car.name]
         if url and not _is_same(url, car.link):

@@ -21,7 +21,7 @@ gateway. `ble`: a Bluetooth device with the service of a car's module. `given`: 
 
 
 class ScanFailed(Exception):
-    """`gateway scan` failed. The text says why."""
+    """`gateway scan` failed, and has said why on stderr."""
 
 
 class FoundLink(Struct, frozen=True):

@@ -24,7 +24,7 @@ _SERVER: Final = ExtendedKeyUsageOID.SERVER_AUTH
 
 
 class BadRequestForCertificate(ValueError):
-    """The text is not a request for a certificate, or the request is not signed with its own key."""
+    """A certificate is not made for this request. The text says why."""
 
 
 class KeyPair(Struct, frozen=True):

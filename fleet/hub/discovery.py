@@ -18,7 +18,8 @@ from fleet.hub.join_code import JoinCode
 
 JOIN_SERVICE: Final = "_car-fleet-hub._tcp.local."
 SEARCH_S: Final = 3.0
-"""Maximum time to look for a hub. Within it, zeroconf asks twice: at once, and after 1 s."""
+"""Time to look for a hub. The last hub found may take a second more. Within this time, zeroconf asks twice: at once,
+and after 1 s."""
 MAX_FOUND_HUBS: Final = 16
 """Maximum number of hubs that are tried."""
 _RESOLVE_MS: Final = 1000

@@ -56,7 +56,10 @@ class KnownIdentity(Struct):
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Self:
-        """Return a stored identity. Raises TypeError or ValueError if a field has a wrong type."""
+        """Return a stored identity.
+
+        Raises ValueError if `until` or `generation` has a wrong type, and TypeError for an unknown field.
+        """
         if type(stored.get("until")) is not str or type(stored.get("generation", 1)) is not int:
             raise ValueError(f"it has {stored}")
         return cls(**stored)
@@ -157,10 +160,10 @@ class HubStore(Struct):
             self._save(listens)
 
     def reserve(self, identity: str, now: datetime | None = None) -> None:
-        """Write the rules for an identity of another computer that has no certificate yet. Raises OSError.
+        """Write the rules for an identity of another computer that has no certificate yet. Raises OSError, BrokenHub.
 
-        An earlier certificate of this identity becomes invalid now, even if it is on this computer. Raises BrokenHub
-        for the identity of this computer's user, because nobody could undo that.
+        An earlier certificate of this identity becomes invalid now, even if it is on this computer. Also raises
+        BrokenHub for the identity of this computer's user, because nobody could undo that.
         """
         if identity == self.credentials.me:
             raise BrokenHub(f"{identity} uses the hub's own computer: invite somebody under another name")
@@ -174,7 +177,8 @@ class HubStore(Struct):
 
         addresses: the addresses of the joining computer, if it becomes a hub.
 
-        Raises OSError, and BadRequestForCertificate, also if the identity was revoked or invited again meanwhile.
+        Raises OSError, BrokenHub, and BadRequestForCertificate, also if the identity was revoked or invited again
+        meanwhile.
         """
         reserved = self.known[identity]
         with self._changing():
@@ -191,7 +195,7 @@ class HubStore(Struct):
     def renew(self, certificate: bytes, request: bytes, identity: str, now: datetime) -> bytes:
         """Return the next certificate of an identity, PEM, for the same key. See `certificate_authority.renew`.
 
-        Raises OSError, and BadRequestForCertificate, also if the identity is revoked.
+        Raises OSError, BrokenHub, and BadRequestForCertificate, also if the identity is revoked.
         """
         with self._changing():
             entry = self.known.get(identity)
@@ -205,7 +209,10 @@ class HubStore(Struct):
         return made
 
     def renew_hub(self, now: datetime) -> bool:
-        """Make the next certificate of the hub itself if it is due. Return False if it is not. Raises OSError."""
+        """Make the next certificate of the hub itself if it is due. Return False if it is not.
+
+        Raises OSError, BrokenHub.
+        """
         certificate = self._read(HUB)
         if not certificate_authority.is_due(certificate, now):
             return False
@@ -219,7 +226,7 @@ class HubStore(Struct):
     def revoke(self, identity: str) -> bool:
         """Deny everything to an identity. It may be revoked already. Return False if it is not known.
 
-        Raises OSError.
+        Raises OSError, BrokenHub.
         """
         with self._changing():
             entry = self.known.get(identity)
@@ -259,7 +266,7 @@ class HubStore(Struct):
         return not is_whole or certificate_authority.is_due(certificate, now, addresses)
 
     def _save(self, listens: Iterable[str] = ()) -> None:
-        """Write the identities, and the rules if they changed. The hub restarts when the rules change."""
+        """Write the identities, and the rules if they changed. The hub opens a new session when the rules change."""
         stored: Mapping[str, object] = {name: to_builtins(each) for name, each in sorted(self.known.items())}
         path = self.directory / HUB_FILE
         chosen = list(listens)

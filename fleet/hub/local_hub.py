@@ -111,7 +111,7 @@ def _check_writable(place: Path) -> None:
 def store_joined(host: str, joined: Joined, site: str = "", site_port: int = 0) -> str:
     """Store what this computer got when it joined, and return the endpoint of its hub. Raises OSError, NotJoined.
 
-    A computer may join again, for a car or a service. Its user stays the person who joined first. `site` is the address
+    A computer may join again. For a car or a service, its user then stays the same person. `site` is the address
     of the hub to use, if it is not the hub that was joined. site_port: the port of that hub, if it differs.
     """
     first = f"tls/{host}:{joined.port}"

@@ -1,6 +1,6 @@
 """Signs the next certificate of one identity.
 
-The hub starts this process, because the hub itself has no access to the authority's key.
+The hub starts this process, so that the hub itself need not load the authority's key.
 
 This process reads one request from stdin and writes the certificate to stdout, or the reason why there is none to
 stderr: `python -m fleet.hub.renewals --endpoint tls/127.0.0.1:7447 --identity person.mia`. Without an identity it
@@ -20,7 +20,7 @@ from schemas.bus.hub_renewals import MAX_RENEWAL_BYTES
 
 
 def main() -> int:
-    """Sign one certificate. Return 0 if it is made, 1 if not."""
+    """Sign one certificate. Return 0 if it is made, or if that of the hub is not due; 1 if it cannot be made."""
     parser = argparse.ArgumentParser(prog="python -m fleet.hub.renewals", description=__doc__)
     parser.add_argument("--endpoint", required=True)
     parser.add_argument("--identity", default="")
