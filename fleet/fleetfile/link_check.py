@@ -97,7 +97,7 @@ def check_device(path: str) -> tuple[bool, str]:
             return False, "there is no such device: plug the car in, switch it on, or bind it again (fleet bind)"
         return False, f"cannot be checked: {error.strerror}"
     if not stat.S_ISCHR(file_stat.st_mode):
-        return False, "is not a serial port but a file or directory"
+        return False, "is not a serial port"
     if not os.access(path, os.R_OK | os.W_OK):
         return False, f"no permission. {permission_hint(path)}"
     holder = serial_port_users.find_holder(file_stat)

@@ -19,7 +19,7 @@ from schemas.printable import printable
 
 JOIN_PORT: Final = 7448
 MAX_JOIN_ANSWER_BYTES: Final = 16 << 20
-"""Maximum size of an answer. It has a fleet file and, for the hub of a site, the rules: 2.4 kB for each identity."""
+"""Maximum size of an answer. It has a fleet file and, for the hub of a site, the rules: 1 to 3 kB for each identity."""
 MAX_HUB_NAMES: Final = 32
 SOCKET_TIMEOUT_S: Final = 10.0
 """Timeout of a connection. A stranger who sends nothing cannot block others for longer."""

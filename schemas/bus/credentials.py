@@ -184,7 +184,10 @@ class Credentials(NamedTuple):
                 SITE: str(found.get(SITE, "")),
             }
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise NoCredentials(f"{path} has no rules of a hub: {error!r}. `fleet hub init` writes them.") from None
+            raise NoCredentials(
+                f"{path} has no rules of a hub: {error!r}. On the first hub's computer, `fleet hub init` writes them. "
+                "At another site, `fleet join` with a new code does."
+            ) from None
 
     def _path(self, name: str, ending: str = ".pem") -> str:
         return str(self.directory / f"{name}{ending}")
