@@ -187,7 +187,7 @@ def _run(run: Demo) -> tuple[Path | None, Path | None]:
     took = time.monotonic() - began
     recorded = _check_recording(run, session)
     rrd = _replay(run, session, recorded)
-    run.say(f"the cars were up for {took:.0f} s")
+    run.say(f"the job took {took:.0f} s")
     return session, rrd
 
 
@@ -273,7 +273,8 @@ def _act(run: Demo, stack: ExitStack, client: Fleet, simulator: "subprocess.Pope
     outcomes = client.stop()
     run.check(
         "stop",
-        f"sent to all three within {max(each.took_s for each in outcomes):.1f} s, shown by {_shown(outcomes)}"
+        f"sent to all three, the last result after {max(each.took_s for each in outcomes):.1f} s, shown by "
+        f"{_shown(outcomes)}"
         if all(each.ok for each in outcomes)
         else ", ".join(str(each) for each in outcomes if not each.ok),
         ok=all(each.ok for each in outcomes),

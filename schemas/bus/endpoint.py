@@ -143,7 +143,10 @@ def accepts(endpoint: str) -> bool:
 
 
 def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
-    """Start a hub if nothing accepts connections at a loopback endpoint, and wait until it listens. Raises BusError."""
+    """Start a hub if nothing accepts connections at a loopback endpoint, and wait until it listens. Raises BusError.
+
+    A hub at a datagram endpoint (udp, quic) is never started here, because `accepts` cannot see that it is missing.
+    """
     # The hub runs in a session of its own and outlives the process that started it. So Ctrl-C at a terminal does not
     # end the bus before the cars have stopped. The hub exits 10 s after its last link has closed. On a busy machine its
     # start takes 10 s.
