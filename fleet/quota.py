@@ -36,7 +36,7 @@ class Quota(Struct, frozen=True):
     """Maximum size of all sessions together, and of one, in bytes. 0 means no limit."""
 
     total: int = 0
-    """The oldest unpinned segments of unmarked sessions are removed first."""
+    """While pinned segments fit into half of it, the oldest unpinned ones of unmarked sessions are removed first."""
     session: int = 0
     """Size at which a session is closed and the next one begins. 0 means a tenth of `total`."""
 

@@ -376,7 +376,7 @@ class RecorderState(StrEnum):
 
 
 class PinCause(StrEnum):
-    """Why a time of a recording is pinned, so that the quota deletes it last."""
+    """Why a time of a recording is pinned. The quota removes pinned times last, while they fit into half of it."""
 
     CONDITION = "condition"
     """A condition of the fleet file."""

@@ -1,8 +1,8 @@
-"""The functions that a condition of a plan may apply to a field: `rate(range_m) < -0.1`. Each is one row of ROWS.
+"""The functions that a condition of a plan, of a pin or of `find` may apply to a field: `rate(range_m) < -0.1`.
 
-For a condition, `rate(range.range_m)` is a name like any other, with the range that its row gives.
-`fleet.policy.snapshot` evaluates the function. A single message has no earlier readings, so `watch` and `wait` have no
-functions.
+Each is one row of ROWS. For a condition, `rate(range.range_m)` is a name like any other, with the range that its row
+gives. `fleet.policy.snapshot` evaluates the function. A single message has no earlier readings, so `watch` and `wait`
+have no functions.
 """
 
 from collections.abc import Callable, Sequence

@@ -209,7 +209,8 @@ class RecordEntry(Entry):
     to: _Path = Field(default_factory=str, description="the directory of sessions, relative to this file")
     quota: _Size = Field(
         default_factory=str,
-        description="maximum size of all sessions in that directory, such as 20GB; beyond it, the oldest are removed",
+        description="maximum size of all sessions in that directory, such as 20GB; beyond it, the oldest minutes are "
+        "removed, but never a marked session",
     )
 
     @property
@@ -219,7 +220,7 @@ class RecordEntry(Entry):
 
 
 class PinEntry(Entry):
-    """A condition. The quota removes the recordings of the times around it last."""
+    """A condition. The quota removes the times around it last, while all pinned times fit into half of it."""
 
     when: str = Field(
         description="the condition, true for at least one car, as in plans: `mode.verdict == 'contradicted'`"
@@ -258,7 +259,7 @@ class FileEntry(Entry):
         default_factory=list,
         max_length=MAX_PIN_RULES,
         description="conditions, such as `[{when: range_m < 0.1}]`: the quota removes the time around them last, as it "
-        "does for stops and marks",
+        "does for stops and marks, while all these times fit into half of it",
     )
     console: bool | ConsoleEntry = Field(
         default=False, description="true: `fleet up` serves the web page; or `{port: 8080}`, which also sets its port"
