@@ -283,7 +283,7 @@ def _find_contradictions(
         if isinstance(given, str) and given and given.isprintable():
             there = _resolve_path(path, given)
             if there is not None and not there.is_file():
-                yield (entry,), f"there is no file {quote_value(given)} beside this one"
+                yield (entry,), f"there is no file {there}"
 
 
 def _find_pin_faults(tree: Mapping[str, Any]) -> Iterator[tuple[Where, str]]:

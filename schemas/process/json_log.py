@@ -1,7 +1,8 @@
-"""Log lines as JSON, for every process, if FLEET_LOG is `json`. All lines about one command have the same id.
+"""Log lines as JSON, for gateways and `fleet`, if FLEET_LOG is `json`. All lines about one command have the same id.
 
 Without the variable each process logs lines for a person. With it, each log line on stderr is one JSON object with
-`time`, `level`, `process`, `pid` and `message`. A line about a command also has its `command_id`, `verb` and `phase`.
+`time`, `level`, `process`, `pid` and `message`. The hub and `gateway sim` write text in any case, and so does a gateway
+that does not understand its arguments. A line about a command also has its `command_id`, `verb` and `phase`.
 The client (a command line, the console, the coordinator, a program) makes the id and sends it in the command's message,
 so the gateway logs the same id. The recording has it too, in `event/command` and `frame/tx`.
 
