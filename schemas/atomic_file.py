@@ -1,4 +1,7 @@
-"""Writes files atomically: readers see the old file or the whole new one, never a part. All state is written so."""
+"""Writes files atomically: readers see the old file or the whole new one, never a part. All state is written so.
+
+This holds for one writer at a time. Two programs that may write the same file need a lock (`process.file_lock`).
+"""
 
 import contextlib
 import os
