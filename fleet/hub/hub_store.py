@@ -132,7 +132,9 @@ class HubStore(Struct):
         take: Iterable[str] = (),
         now: datetime | None = None,
     ) -> None:
-        """Make missing or due certificates: of the authority, the hub, and the identities here. Then write the rules.
+        """Make the authority if it is missing, and missing or due certificates of the hub and the identities here.
+
+        Then write the rules.
 
         `addresses` are IP addresses and names under which others reach the hub. `listens` are the hub's endpoints, if
         they change. `take` are further identities for this computer. A certificate that another computer has for one of

@@ -24,7 +24,10 @@ class Singleton:
         self._timeout_s = timeout_s
 
     def others(self) -> list[Any]:
-        """Return the status messages of all other services of this kind. It blocks until they have answered."""
+        """Return the status messages of all other services of this kind.
+
+        It blocks until they have answered, but at most for twice `timeout_s`.
+        """
         found: list[Any] = []
         deadline, busy = time.monotonic() + self._timeout_s, True
         while busy and time.monotonic() < deadline:
