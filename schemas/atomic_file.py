@@ -1,10 +1,11 @@
 """Writes files atomically: readers see the old file or the whole new one, never a part. All state is written so.
 
-This holds for one writer at a time. Two programs that may write the same file need a lock (`process.file_lock`).
+Of several writers, the last one wins. Programs that change a part of a file need a lock (`process.file_lock`).
 """
 
 import contextlib
 import os
+import threading
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +20,7 @@ def write_atomically(path: Path, data: bytes, *, sync: bool = False, private: bo
     the new one is whole. With `private`, only the user can read the file, also while it is being written, and its mode
     becomes 0600.
     """
-    scratch = path.with_name(f".{path.name}.new")
+    scratch = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.new")
     try:
         if private:
             scratch.unlink(missing_ok=True)

@@ -113,7 +113,7 @@ CAR_TOPICS: Final = (
         1.0,
         _READING,
         {"raw": "count"},
-        {"raw": (0.0, 1023.0)},
+        {"raw": (0.0, 4095.0)},
         entity="grayscale",
     ),
     Topic("sensor/line", "fleet.v1.Line", "line sensors", Qos.READING, _TRACKING_HZ, _READING, entity="line"),

@@ -126,20 +126,23 @@ class MqttBridge:
         """Connect, and connect again whenever the connection breaks, until the end."""
         failures = 0
         connected: bool | None = None  # None before the first attempt
+        was_refused = False
         while not ended.is_set():
             try:
                 async with self._client() as client:
                     if connected is not True:
                         self._notify(f"Publishing to {self._broker.words} (Ctrl-C ends it)")
-                    connected, failures = True, 0
+                    connected, failures, was_refused = True, 0, False
                     await self._publish(client, ended)
             except aiomqtt.MqttError as error:
                 refused = isinstance(error, aiomqtt.MqttCodeError) and _code(error) in _REFUSED
                 if refused and connected is None:
                     raise BrokerRefused(f"{self._broker.words} refuses the user or the password") from None
-                if connected is not False:
+                if refused and not was_refused:
+                    self._notify(f"{self._broker.words} refuses the user or the password. The bridge tries again.")
+                elif not refused and connected is not False:
                     self._notify(f"The broker at {self._broker.words} is away ({error}). The bridge tries again.")
-                connected, failures = False, failures + 1
+                connected, failures, was_refused = False, failures + 1, refused
                 with suppress(TimeoutError):
                     await asyncio.wait_for(ended.wait(), backoff_s(failures, _FIRST_RETRY_S, _LONGEST_RETRY_S))
 

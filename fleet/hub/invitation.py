@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from fleet.hub import certificate_authority
 from fleet.hub.certificate_authority import BadRequestForCertificate
-from fleet.hub.hub_store import HubStore
+from fleet.hub.hub_store import BrokenHub, HubStore
 from fleet.hub.join import JOIN_PORT, MAX_HUB_NAMES, SOCKET_TIMEOUT_S
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, MAX_GUESSES, JoinCode
 from schemas.bus.credentials import CA_FILE, HUB, OF_SITES
@@ -100,6 +100,8 @@ class Invitation:
                 return 400, {"error": str(error)}
             except OSError as error:
                 return 500, {"error": f"the hub cannot store the certificate: {error.strerror or error}"}
+            except BrokenHub as error:
+                return 500, {"error": f"the hub cannot sign the certificate: {error}"}
             self.joined_from = source
             self._over.set()
             own = {"certificate": certificate.decode(), "ca": self._ca.decode(), "rules": rules}

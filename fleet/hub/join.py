@@ -126,7 +126,11 @@ def join_one_of(
 
 def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -> dict[str, Any]:
     """Send a request and return the fields of the answer. Raises NotJoined."""
-    connection = http.client.HTTPSConnection(where, timeout=SOCKET_TIMEOUT_S, context=context)
+    try:
+        connection = http.client.HTTPSConnection(where, timeout=SOCKET_TIMEOUT_S, context=context)
+        where.encode("idna")  # as for the connection
+    except (http.client.InvalidURL, UnicodeError):
+        raise NotJoined(f"{printable(where)} is not the address of a computer") from None
     try:
         connection.request(method, "/join", body)
         answer = connection.getresponse()

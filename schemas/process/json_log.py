@@ -9,6 +9,7 @@ so the gateway logs the same id. The recording has it too, in `event/command` an
 A client logs each command that it sent and how it ended. A gateway logs one line for each record of `event/command`.
 """
 
+import atexit
 import io
 import json
 import logging
@@ -73,9 +74,18 @@ class _JsonLines(io.TextIOBase):
     def write(self, text: str) -> int:
         """Log each whole line."""
         *whole, self._rest = (self._rest + text).split("\n")
-        for line in filter(str.strip, whole):
-            logging.getLogger(__name__).warning("%s", line, extra=fields(stream=_STDERR))
+        for line in whole:
+            self._log(line)
         return len(text)
+
+    def end(self) -> None:
+        """Log a last line without an end."""
+        rest, self._rest = self._rest, ""
+        self._log(rest)
+
+    def _log(self, line: str) -> None:
+        if line.strip():
+            logging.getLogger(__name__).warning("%s", line, extra=fields(stream=_STDERR))
 
 
 def begin(process: str) -> bool:
@@ -85,7 +95,8 @@ def begin(process: str) -> bool:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter(process))
     logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)
-    sys.stderr = _JsonLines()
+    sys.stderr = lines = _JsonLines()
+    atexit.register(lines.end)
     return True
 
 

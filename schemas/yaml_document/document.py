@@ -4,6 +4,7 @@ It limits size, depth and aliases. fault_words.py puts faults into words. The me
 checked in the packages of those files.
 """
 
+import codecs
 import json
 import math
 import re
@@ -135,6 +136,8 @@ def read_text(path: Path, source: str | None = None) -> str:
         raise _bad_file(source, f"cannot be read: {error}") from None
     if kind:
         raise _bad_file(source, f"is a {kind}, not a file: save the text as a file, and give that file")
+    if len(data) > MAX_YAML_BYTES and data.startswith(codecs.BOM_UTF8):
+        raise _bad_file(source, _TOO_LARGE)  # without its mark, the beginning would look like a whole file
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

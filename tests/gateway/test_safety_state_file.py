@@ -1,7 +1,9 @@
 """The state file survives a restart. The gateway writes it whole, and an unreadable file counts as a hold."""
 
 import json
+import os
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -128,7 +130,7 @@ def test_failed_save_is_told_and_keeps_old_state(tmp_path: Path) -> None:
     assert SafetyStateFile(tmp_path / "file", "fleet", "red", LINK).load(NOW).hold is not None
     store = SafetyStateFile(tmp_path, "fleet", "red", LINK)
     store.save(PersistedSafety(Hold("mia", 1)))
-    (tmp_path / ".fleet.red.json.new").mkdir()
+    (tmp_path / f".fleet.red.json.{os.getpid()}-{threading.get_ident()}.new").mkdir()
     with pytest.raises(OSError, match="fleet"):
         store.save(PersistedSafety())
     assert store.load(NOW) == PersistedSafety(Hold("mia", 1))

@@ -166,6 +166,18 @@ def test_car_comes_acts_and_goes(tmp_path: Path, broker: Mosquitto, reader: Mqtt
         assert kept(broker) == {}
 
 
+def test_password_that_is_refused_after_an_outage_is_told(tmp_path: Path, broker: Mosquitto) -> None:
+    with contextlib.closing(FleetProcesses(f"tcp/127.0.0.1:{free_port()}", tmp_path)) as fleet:
+        broker.kill()
+        mqtt = bridge(fleet, broker, "wrong")
+        wait_for(lambda: len(mqtt.lines()) == 1, "it says that the broker is away")
+        broker.start()
+        wait_for(
+            lambda: any("refuses" in line for line in mqtt.lines()), "it says that the broker refuses the password"
+        )
+        assert mqtt.end() == 0
+
+
 def test_broker_outage_and_killed_bridge(tmp_path: Path, broker: Mosquitto, reader: MqttReader) -> None:
     with contextlib.closing(FleetProcesses(f"tcp/127.0.0.1:{free_port()}", tmp_path)) as fleet:
         _, (link,) = fleet.simulate("red:arduino:tcp")

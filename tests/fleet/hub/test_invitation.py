@@ -3,6 +3,7 @@
 import http.client
 import json
 import resource
+import shutil
 import socket
 import ssl
 from collections.abc import Iterator
@@ -108,6 +109,20 @@ def test_join_on_the_hubs_own_computer_spends_no_code(
         assert (done.returncode, done.stdout) == (1, "")
         assert "still good" in done.stderr
         assert join("127.0.0.1", opened.code, opened.port).identity == person("mia")
+
+
+def test_hub_that_cannot_sign_says_so(invitation: Invitation, store: HubStore, tmp_path: Path) -> None:
+    other = made(tmp_path / "other")
+    shutil.copy(other.directory / "ca.key", store.directory / "ca.key")
+    with pytest.raises(NotJoined, match="cannot sign"):
+        join("127.0.0.1", invitation.code, invitation.port)
+
+
+@pytest.mark.parametrize("host", ["a b", "a..b"])
+def test_host_that_is_no_address_is_refused(host: str, invitation: Invitation, tmp_path: Path) -> None:
+    done = in_process.fleet("join", host, invitation.code, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "is not the address of a computer" in done.stderr
 
 
 def test_join_code_works_once(invitation: Invitation, store: HubStore) -> None:

@@ -16,6 +16,7 @@ import serial
 from gateway.link import BadUrl, CannotOpen, open_link, parse_url
 from gateway.link.tcp import connect_first
 from schemas.links import BleUrl, LinkUrl, SerialUrl, TcpUrl, UsbUrl
+from schemas.process.serial_port_permission import permission_hint
 from tests.gateway.link.peers import PtyPeer, no_threads
 from tests.support.text_parts import has_parts
 
@@ -171,14 +172,15 @@ except CannotOpen as error:
 """
 
 
-def test_serial_port_without_permission_names_group(tmp_path: Path) -> None:
+@pytest.mark.parametrize("may_use", [True, False])
+def test_serial_port_without_permission_names_group_that_may_use_it(tmp_path: Path, *, may_use: bool) -> None:
     """Root may open any port, so a process of the user nobody tries. Other users try in this process."""
     peer = PtyPeer(tmp_path)
     port = (tmp_path / "tty").resolve()
-    port.chmod(0)
+    port.chmod(0o060 if may_use else 0)
     script = WITHOUT_PERMISSION
     if os.getuid() == 0:
-        os.chown(port, -1, 0)
+        os.chown(port, -1, grp.getgrnam("tty").gr_gid)
     else:
         script = script.replace("os.setgroups([]); os.setgid(65534); os.setuid(65534)", "")
     group = grp.getgrgid(port.stat().st_gid).gr_name
@@ -187,8 +189,17 @@ def test_serial_port_without_permission_names_group(tmp_path: Path) -> None:
     )
     assert done.stderr == ""
     assert done.stdout.startswith(f"serial://{port}: no permission. ")
-    assert f"`sudo usermod -aG {group} $USER`" in done.stdout
+    assert (f"`sudo usermod -aG {group} $USER`" in done.stdout) is may_use
     peer.close()
+
+
+def test_nobody_is_told_to_join_group_root(tmp_path: Path) -> None:
+    port = tmp_path / "port"
+    port.touch(0o660)
+    if os.getuid() == 0:
+        os.chown(port, 0, 0)
+        assert "usermod" not in permission_hint(str(port))
+    assert "usermod" not in permission_hint(str(tmp_path / "none"))
 
 
 async def test_unreachable_tcp_car_is_refused() -> None:

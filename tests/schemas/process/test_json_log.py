@@ -2,7 +2,11 @@
 
 import json
 import logging
+import os
+import subprocess
+import sys
 
+from schemas.process import json_log
 from schemas.process.json_log import JsonFormatter, fields, message_in
 
 
@@ -29,3 +33,16 @@ def test_supervisor_reads_the_words_of_such_a_line() -> None:
     assert message_in(line_of("bye", level=logging.WARNING, stream="stderr")) == ("ERROR", "bye")
     for other in ("", "{", "[1]", "{}", "12:00:00 UTC ERROR no link", '{"level": "error"}', "null"):
         assert message_in(other) is None
+
+
+def test_last_line_without_an_end_is_logged_too() -> None:
+    script = 'import sys; from schemas.process import json_log; json_log.begin("x"); sys.stderr.write("one\\ntwo")'
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, json_log.LOG_VARIABLE: "json"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert [message_in(line) for line in done.stderr.splitlines()] == [("ERROR", "one"), ("ERROR", "two")]

@@ -119,6 +119,13 @@ def test_no_more_faults_are_told_than_somebody_reads() -> None:
     assert lines[-1].endswith(": error: and 30 more")
 
 
+def test_too_large_file_with_a_byte_order_mark_is_not_cut(tmp_path: Path) -> None:
+    path = tmp_path / "f.yaml"
+    path.write_bytes(b"\xef\xbb\xbf" + b"#" * (MAX_YAML_BYTES - 10) + b"\nwheels: {}")
+    with pytest.raises(BadFile, match="more than 256 KiB"):
+        read_text(path)
+
+
 def test_file_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "f.yaml"
     path.write_bytes(b"wheels: {}\nmode: caf\xe9\n")
