@@ -299,7 +299,8 @@ example:
 def merge(several: tuple[Path, ...], out: Path) -> None:
     """Merge sessions that several recorders of one fleet recorded at the same time, for example at two sites.
 
-    A message that several recorders received is written once. The recorders' clocks decide the order of the messages.
+    A message that several recorders received is written once, unless its publisher did not number it. The recorders'
+    clocks decide the order of the messages.
     """
     from fleet.recording.tools import merge_cut_recover
 

@@ -1,4 +1,4 @@
-"""Parses times within a session as users type them: an offset from its start or end, or a date. Pure."""
+"""Parses times as users type them, in a session or in the past: an offset, a time of day, or a date. Pure."""
 
 import re
 from datetime import UTC, datetime, timedelta
@@ -31,8 +31,8 @@ def span_ns(text: str, start_ns: int, end_ns: int, now_s: float) -> tuple[int, i
     """Return begin and end, ns, of a time that a person types for a session from `start_ns` to `end_ns`.
 
     A time of day and a date without a zone are local. A time of day without a day is a time within the session. Raises
-    ValueError. Its text has the range of the session (and the syntax, if the text is not a time), or the days if the
-    session has this time of day on several. `now_s` is the wall clock.
+    ValueError. The message has the range of the session (and the syntax, if `text` is not a time). If the session has
+    this time of day several times, the message has their days instead. `now_s` is the wall clock.
     """
     try:
         return _span_ns(text, start_ns, end_ns, now_s)

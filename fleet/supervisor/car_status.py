@@ -50,7 +50,7 @@ class CarStatus:
         self.state.present |= topic.startswith("state/")
         match topic:
             case "state/link":
-                # A bridge that is in use accepts a connection, and closes it before it sends a byte.
+                # A bridge that is in use accepts a connection, and soon closes it, often before it sends a byte.
                 self.reached |= value.state in _OPEN and (value.rx_bytes > 0 or value.since_s >= REACHED_S)
                 self._count(value.rx_frames, now)
                 return self._change("link", f"link {value.state}{f': {value.reason}' if value.reason else ''}")

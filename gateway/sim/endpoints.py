@@ -1,6 +1,7 @@
 """The end of a simulated car's link that a host opens: a pseudo terminal or a listening TCP port.
 
-A link passes the host's bytes to its owner. Bytes that the car sends while there is no host are lost, as on a wire.
+A link passes the host's bytes to its owner. Bytes that the car sends while there is no host are lost on TCP. A terminal
+keeps them until its buffer is full, but a gateway drops them when it opens the terminal, as pyserial does.
 """
 
 import asyncio
@@ -61,7 +62,7 @@ class SimEndpoint(Protocol):
         """Send bytes to the host, if there is one."""
 
     def hold(self, *, on: bool) -> None:
-        """Pause or resume reading. Meanwhile the host can write until the system's buffers are full."""
+        """Pause or resume reading. During a pause the host can write until the system's buffers are full."""
         self._held = on
         self._update_reading()
 
@@ -322,7 +323,7 @@ class TcpEndpoint(SimEndpoint):
             self._server.close()
             self._server = None
         if self._transport is not None:
-            # Linger 0 turns the close into a reset, which is what a host sees when a bridge loses its power.
+            # Linger 0 turns the close into a reset. A host also gets one from a bridge that lost its power and is back.
             linger = struct.pack("HH" if os.name == "nt" else "ii", 1, 0)
             self._transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
             transport, self._transport = self._transport, None

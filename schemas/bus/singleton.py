@@ -1,8 +1,8 @@
 """Makes sure that there is only one service of a kind, such as one gateway per car.
 
 Each service answers queries of its status. At its start, a service queries the others and gives up if one answers. Two
-that start at the same moment may miss each other, so each queries again after both have declared. Then the one with the
-higher boot id gives up.
+that start at the same moment may miss each other, so each queries again a moment later, when both can answer. Then the
+one with the higher boot id gives up.
 """
 
 import time

@@ -1,6 +1,7 @@
 """Summarizes a session from session.json and the index of each file.
 
-It reads messages only where these do not suffice: in a file without a complete index, and to count stops.
+It reads messages only where these do not suffice: in a file without a complete index, and for stops and marks that
+session.json lacks.
 """
 
 import shlex
@@ -83,7 +84,7 @@ class SessionSummary(Struct):
 
 
 def overviews(root: Path) -> Iterator[SessionSummary]:
-    """Yield every session in a directory, by name. Raises OSError if the directory cannot be listed."""
+    """Yield a summary of each session in a directory, by name. Raises OSError if the directory cannot be listed."""
     yield from map(overview, filter(session_dir.is_session, sorted(root.iterdir())))
 
 
@@ -179,7 +180,7 @@ class _Span:
 
 
 def growth_check(session: Session) -> Callable[[], bool]:
-    """Return a function that tells if an unclosed session has grown since now. It waits up to MAX_GROWTH_WAIT_S."""
+    """Return a function that tells if a session has grown since this call. It waits up to MAX_GROWTH_WAIT_S."""
     began, before = time.monotonic(), _size(session.segments)
 
     def has_grown() -> bool:
@@ -227,7 +228,7 @@ def stops_of(session: Session, about: SessionSummary) -> int:
 
 
 def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[tuple[int, Any]]:
-    """Yield the messages on the keys of a topic, each after its time in ns. Read only the chunks that contain one."""
+    """Yield the messages of a topic, each with its time in ns. Read only chunks that may contain one, if indexed."""
     decoder = MessageDecoder()
     selected = tuple(key for key in about.keys if key.endswith(f"/{topic}"))
     for info, _, log_ns, _, data in session.rows(Selection(selected)) if selected else ():

@@ -19,7 +19,8 @@ from schemas import keys, topics
 from schemas.commands import COMMANDS
 
 BATCH_BYTES: Final = 4 << 20
-"""Maximum buffered size of one table: its payloads, and ROW_BYTES per row."""
+"""Buffered size at which a table is written: its payloads, and ROW_BYTES per row. Messages that another table could
+not decode do not count."""
 ROW_BYTES: Final = 256
 OTHER_TABLE: Final = "other"
 STRAY_PREFIX: Final = "stray."
@@ -125,7 +126,7 @@ def _split_undecodable(batch: _Batch, message_class: type[Message]) -> tuple[_Ba
 
 
 class _Export:
-    """Tables of a session found so far."""
+    """The tables that the messages of a session have needed so far."""
 
     def __init__(self, open_sink: Callable[[str, Sequence[tables.Column]], Sink]) -> None:
         self._open_sink = open_sink
@@ -210,7 +211,7 @@ def is_stray(info: ChannelInfo) -> bool:
 
 
 def own_type(key: str) -> str:
-    """Return the full name of the messages of a key, or an empty text if the key is not ours."""
+    """Return the full name of the message type of a key, or an empty text if the key is not ours."""
     topic = topics.of_key(key)
     if topic is not None:
         return topic.message
