@@ -46,7 +46,9 @@ class EventCode(Struct, frozen=True):
 EVENTS: Final[dict[str, EventCode]] = {
     "link_open": EventCode(Level.INFO, "The link is open, and the gateway brings the car to a known state."),
     "link_lost": EventCode(Level.WARNING, "The link is lost. The text has the cause."),
-    "recovered": EventCode(Level.INFO, "The car is stopped in mode manual, and accepts commands."),
+    "recovered": EventCode(
+        Level.INFO, "The recovery stop of the car is over, shown or only sent. The car accepts commands."
+    ),
     "platform_settled": EventCode(Level.INFO, "The readings show which program the car runs."),
     "platform_contradicted": EventCode(Level.WARNING, "The readings do not fit the platform in the fleet file."),
     "mode_contradicted": EventCode(Level.WARNING, "The readings do not fit the commanded mode."),
@@ -103,6 +105,6 @@ EVENTS: Final[dict[str, EventCode]] = {
     "parent_gone": EventCode(
         Level.WARNING, "The process that started this gateway has ended, so the gateway ends too."
     ),
-    "internal_error": EventCode(Level.ERROR, "The coordinator failed in one decision, and continues."),
+    "internal_error": EventCode(Level.ERROR, "The coordinator failed in one step of its work, and continues."),
 }
 """Codes of `event/log` of cars, and of `@coordinator/log`."""
