@@ -68,7 +68,8 @@ def run(
 ) -> None:
     """Run a plan until Ctrl-C, and print one line per decision. The plan leaves alone what you have stopped.
 
-    Ctrl-C brings the cars of the plan to rest, and waits for that, at most until the next Ctrl-C.
+    Ctrl-C brings the cars of the plan to rest, and waits for that, at most until the next Ctrl-C. The exit code is 1 if
+    one of them may still be moving.
     """
     parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
@@ -97,7 +98,7 @@ def run(
         identity=service(Service.COORDINATOR),
     ) as client:
         try:
-            Coordinator(
+            moving = Coordinator(
                 client,
                 plan,
                 on_decided,
@@ -108,6 +109,7 @@ def run(
             ).run(lambda: stop.is_set() or has_ended(parent), hurry.is_set)
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
+    raise SystemExit(1 if moving else 0)
 
 
 def decision_line(decision: Decision) -> str:

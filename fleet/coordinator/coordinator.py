@@ -37,9 +37,11 @@ from schemas.gen import fleet_v1_pb2 as pb
 from schemas.limits import SHUTDOWN_S
 from schemas.process.computer_sleep import MONOTONIC_COUNTS_SLEEP, SleepWatch, clock_pair
 from schemas.rights import People
-from schemas.words import Level, Phase
+from schemas.words import Level, Mode, Phase
 
 STEP_INTERVAL_S: Final = 0.1
+MIN_REST_S: Final = 1.0
+"""Minimum time at the end for the commands that bring cars to rest, also after a second Ctrl-C."""
 SINGLETON_RECHECK_S: Final = 1.0
 """Delay of the second search for other coordinators. Two that start at the same moment do not find each other at first.
 """
@@ -73,6 +75,8 @@ class Coordinator:
     _state_file: CoordinatorStateFile | None = None
     _restored: bool = False
     """True once the persisted state is restored."""
+    _sent_off: set[str] = field(default_factory=set)
+    """The cars whose last mode by the plan lets them move by themselves, also those that cannot be reached now."""
     _persisted: PolicyState | None = None
     """The state to persist from now on, because the coordinator is ending. None before that."""
     _early: list[zenoh.Query] = field(default_factory=list)
@@ -86,11 +90,12 @@ class Coordinator:
         self._publications = Publications(self.client, self.on_failure)
         self._commands = OpenCommands(self.client, self.on_failure)
 
-    def run(self, has_ended: Callable[[], bool], gives_up: Callable[[], bool] = lambda: False) -> None:
+    def run(self, has_ended: Callable[[], bool], gives_up: Callable[[], bool] = lambda: False) -> list[str]:
         """Coordinate until `has_ended()`. Then bring the cars of the plan to rest, until `gives_up()`.
 
-        In a run of `fleet up`, the cars keep their modes: the supervisor stops them, or starts the coordinator again.
-        Raises AnotherCoordinator, and then leaves the cars to the other one.
+        Return the cars that may still be moving. In a run of `fleet up`, the cars keep their modes, and none is
+        returned: the supervisor stops them, or starts the coordinator again. Raises AnotherCoordinator, and then leaves
+        the cars to the other one.
         """
         bus, fleet = self.client.bus, self.client.name
         declare_alone(self.client)
@@ -117,13 +122,15 @@ class Coordinator:
                 self._restored = True
                 for query in self._early:
                     self._answer(query, observer)
+                moving: list[str] = []
                 try:
                     self._coordinate(observer, pool, recheck_at, has_ended)
                 finally:
                     if not self.run_name and not isinstance(sys.exception(), AnotherCoordinator):
-                        self._bring_to_rest(observer, pool, gives_up)
+                        moving = self._bring_to_rest(observer, pool, gives_up)
             finally:
                 self.client.close()  # ends pending commands
+        return moving
 
     def _coordinate(
         self, observer: FleetObserver, pool: ThreadPoolExecutor, recheck_at: float, has_ended: Callable[[], bool]
@@ -149,27 +156,41 @@ class Coordinator:
                 yield_to_another(self.client)
             self._publications.republish(now)
 
-    def _bring_to_rest(self, observer: FleetObserver, pool: ThreadPoolExecutor, gives_up: Callable[[], bool]) -> None:
-        """Bring the cars of the plan to rest, as `fleet plan stop` does. Wait for at most SHUTDOWN_S.
+    def _bring_to_rest(
+        self, observer: FleetObserver, pool: ThreadPoolExecutor, gives_up: Callable[[], bool]
+    ) -> list[str]:
+        """Bring the cars of the plan to rest, as `fleet plan stop` does. Return those that may still be moving.
 
-        A person who ends a coordinator by hand and starts another one wants the plan to go on. So the persisted state
-        stays that from before.
+        Wait for at most SHUTDOWN_S, also for a hub, a gateway or a link that is gone. A person who ends a coordinator
+        by hand and starts another one wants the plan to go on. So the persisted state stays that from before.
         """
         self._persisted = replace(self._memory, stopped_by="", to_rest=frozenset())
-        shown, until = self.on_decision, time.monotonic() + SHUTDOWN_S
+        bus, shown, began = self.client.bus, self.on_decision, time.monotonic()
         self.on_decision = lambda decision: _if_possible(shown, decision)
+        hub_keeper = HubKeeper(bus.endpoint, lambda words: _if_possible(self.on_failure, words))
         by = self.client.sender.removeprefix(SENDER)
-        self._memory, _ = on_request(PlanRequest.STOP, self.plan, self._memory, by, time.monotonic())
-        self._save(self._memory)
-        cars = moving = sorted(self._memory.to_rest)
-        while moving and self.client.bus.link and time.monotonic() < until and not gives_up():
-            self._try_step(observer, pool, time.monotonic())
+        self._memory, _ = on_request(PlanRequest.STOP, self.plan, self._memory, by, began)
+        self._memory = replace(self._memory, to_rest=self._memory.to_rest | self._sent_off)
+        cars = sorted(self._memory.to_rest)
+        while True:
+            now, link = time.monotonic(), bus.link
+            hub_keeper.check(connected=bool(link))
+            if link:
+                self._try_step(observer, pool, now)
             self._drain_inbox(observer, pool)
             asked = {each.car for each in self._memory.decisions.values() if each.kind is DecisionKind.IDLE}
-            moving = [car for car in cars if car in asked or may_move_by_plan(observer.cars.get(car, UNKNOWN_CAR))]
+            moving = [
+                car
+                for car in cars
+                if car in asked or may_move_by_plan(observer.cars.get(car, UNKNOWN_CAR), sent_off=car in self._sent_off)
+            ]
+            waited_s = time.monotonic() - began
+            if not moving or waited_s >= SHUTDOWN_S or (gives_up() and waited_s >= MIN_REST_S):
+                break
         if moving:
             names = ", ".join(moving)
             _if_possible(self.on_failure, f"NOT CONFIRMED: {names} may still be moving. Type `fleet stop`.")
+        return moving
 
     def _check_sleep(self, observer: FleetObserver, now: float) -> None:
         """After a sleep of the computer, decide only by new readings. No car loses its role because of the sleep."""
@@ -201,6 +222,9 @@ class Coordinator:
         gone = before.decisions.keys() - result.memory.decisions.keys()
         self._publications.forget(gone)
         self._commands.forget(gone)
+        for decision in result.decisions:
+            if decision.car is not None and decision.mode is not None and self._persisted is None:
+                (self._sent_off.discard if decision.mode is Mode.MANUAL else self._sent_off.add)(decision.car)
         since_s = time.time() - now
         for decision in (*result.changed, *result.reworded):
             self._publications.publish("decision", decision_message(decision, since_s + decision.since))
@@ -221,11 +245,17 @@ class Coordinator:
     def _check_sender(self, observer: FleetObserver, by: str) -> None:
         check_sender(observer.people if self.people is None else self.people, by)
 
+    def _check_running(self) -> None:
+        """Raise RequestRefused if this coordinator brings its cars to rest because it ends."""
+        if self._persisted is not None:
+            raise RequestRefused("This coordinator is ending. `fleet plan run` starts another one.")
+
     def _on_request(self, query: zenoh.Query, request: PlanRequest, observer: FleetObserver) -> None:
         """Carry out a request for the plan in force. Persist the state and publish an event before the reply."""
         try:
             by = sender_of(query, "fleet.v1.PlanCommand")
             self._check_sender(observer, by)
+            self._check_running()
             memory, words = on_request(request, self.plan, self._memory, by, time.monotonic())
         except RequestRefused as refused:
             reply_result(query, rejected(refused))
@@ -255,6 +285,7 @@ class Coordinator:
         try:
             text, by = plan_command(query)
             self._check_sender(observer, by)
+            self._check_running()
             plan = parse(text)
         except RequestRefused as refused:
             result = rejected(refused)

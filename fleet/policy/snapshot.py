@@ -170,10 +170,13 @@ def _profile(platform: str) -> CarProfile | None:
 UNKNOWN_CAR: Final = CarSnapshot()
 
 
-def may_move_by_plan(known: CarSnapshot) -> bool:
-    """Return True if a car that a plan commanded may still be moving, and no person has taken it."""
+def may_move_by_plan(known: CarSnapshot, *, sent_off: bool) -> bool:
+    """Return True if a car of a plan may still be moving, and no person has taken it.
+
+    sent_off: the plan has commanded it into a mode in which it moves, so it may move although its gateway is gone.
+    """
     is_free = known.taken_by is None and known.driven_by is None
-    return known.present and is_free and known.motors != Motors.OFF
+    return is_free and (known.motors != Motors.OFF if known.present else sent_off)
 
 
 class FleetSnapshot(Struct, frozen=True):

@@ -364,19 +364,42 @@ def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: 
     assert (truth(cars, "red"), driving(cars.sim, "red")) == ("manual", False)
 
 
-def test_car_that_does_not_react_at_the_end_is_named_and_next_ctrl_c_ends_at_once(cars: Cars, tmp_path: Path) -> None:
-    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
-    lines = Lines(process)
-    lines.until("red", "tracking", "role tracking")
+def tracking(cars: Cars, path: Path) -> GatewayProcess:
+    """Start a plan, and wait until its car tracks."""
+    process = coordinator(cars, path, "fixed: {red: {mode: tracking}}")
+    Lines(process).until("red", "tracking", "role tracking")
     wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
-    cars.sim.say({"car": "red", "fault": "deaf"})
-    try:
-        os.kill(process.pid, signal.SIGINT)
-        lines.until("red", "manual", "red is brought to rest")
-        assert process.end(signal.SIGINT) == 0
-        assert "NOT CONFIRMED: red may still be moving" in process.stderr
-    finally:
-        cars.sim.say({"car": "red", "fault": "deaf", "for_s": 0})
+    return process
+
+
+def test_second_signal_at_once_does_not_take_back_the_stop(cars: Cars, tmp_path: Path) -> None:
+    process = tracking(cars, tmp_path / "plan.yaml")
+    os.kill(process.pid, signal.SIGINT)
+    process.end(signal.SIGINT)
+    wait_for(lambda: truth(cars, "red") == "manual" and not driving(cars.sim, "red"), "red stands")
+
+
+def test_end_waits_for_a_link_that_is_gone(cars: Cars, tmp_path: Path) -> None:
+    process = tracking(cars, tmp_path / "plan.yaml")
+    cars.sim.say({"car": "red", "fault": "link_drop"})
+    Lines(process).until("red", None, "the link of red is lost")
+    os.kill(process.pid, signal.SIGINT)
+    wait_for(lambda: any(each.stopped_by for each in cars.get("fleet/@coordinator/assignment")), "it stops the plan")
+    cars.sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
+    assert process.wait() == 0
+    assert (truth(cars, "red"), driving(cars.sim, "red")) == ("manual", False)
+
+
+def test_car_whose_gateway_is_gone_at_the_end_is_named(cars: Cars, tmp_path: Path) -> None:
+    process = tracking(cars, tmp_path / "plan.yaml")
+    cars.gateways["red"].kill()
+    Lines(process).until("red", None, "not on the bus")
+    os.kill(process.pid, signal.SIGINT)
+    wait_for(lambda: any(each.stopped_by for each in cars.get("fleet/@coordinator/assignment")), "it stops the plan")
+    assert process.end(signal.SIGINT) == 1
+    assert "NOT CONFIRMED: red may still be moving" in process.stderr
+    cars.gateways["red"] = cars.serve("red")
+    cars.ready("red")
 
 
 def test_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path) -> None:
@@ -392,3 +415,20 @@ def test_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path
     cars.ready("green")
     lines.until("green", "manual", "no role for it: watch: it has its car: blue")
     assert process.end(signal.SIGTERM) == 0
+
+
+def test_car_that_does_not_react_at_the_end_is_named_and_next_ctrl_c_ends_at_once(cars: Cars, tmp_path: Path) -> None:
+    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
+    lines = Lines(process)
+    lines.until("red", "tracking", "role tracking")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    cars.sim.say({"car": "red", "fault": "deaf"})
+    try:
+        os.kill(process.pid, signal.SIGINT)
+        lines.until("red", "manual", "red is brought to rest")
+        restart = fleet_command("plan", "restart", environment={"FLEET_ENDPOINT": cars.endpoint})
+        assert "is ending" in restart.stderr
+        assert process.end(signal.SIGINT) == 1
+        assert "NOT CONFIRMED: red may still be moving" in process.stderr
+    finally:
+        cars.sim.say({"car": "red", "fault": "deaf", "for_s": 0})
