@@ -127,11 +127,11 @@ class SessionPath(click.ParamType[Path]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Return the path. Fail if there are fewer sessions than `latest~N` needs."""
-        place = (ctx.meta.get(_PLACE) if ctx is not None else None) or sessions_place()
+        place = ctx.meta.get(_PLACE) if ctx is not None else None
         try:
             return find_session(value, place)
         except NoLatest as error:
-            if newest_first(place):
+            if newest_first(place or sessions_place()):
                 self.fail(str(error), param, ctx)
             raise click.ClickException(str(error)) from None
 

@@ -128,7 +128,7 @@ def _ask(where: str, context: ssl.SSLContext, method: str, body: bytes | None) -
     """Send a request and return the fields of the answer. Raises NotJoined."""
     try:
         connection = http.client.HTTPSConnection(where, timeout=SOCKET_TIMEOUT_S, context=context)
-        where.encode("idna")  # as for the connection
+        connection.host.encode("idna")  # as for the connection
     except (http.client.InvalidURL, UnicodeError):
         raise NotJoined(f"{printable(where)} is not the address of a computer") from None
     try:

@@ -25,17 +25,30 @@ class NoLatest(LookupError):
 
 
 def sessions_place() -> Path:
-    """Return the directory of sessions: the one that the fleet file here names, or else `sessions`.
+    """Return the directory of sessions: the one that the fleet file here names, or `sessions`.
 
-    `fleet up` records there. But if only `sessions` exists, return it.
+    `fleet up` records there, and with `--sim` in `sessions`. If both exist, return the one that was changed last.
     """
+    return _places()[0]
+
+
+def _places() -> list[Path]:
+    """Return the directories in which `fleet up` here may have recorded, the likeliest first."""
     named: Path | None = None
     with suppress(OSError, ValueError):  # BadFile is a ValueError
         if "record" in _FLEET_YAML.read_text(encoding="utf-8"):  # otherwise, do not load the parser, which takes long
             from fleet.fleetfile.fleet_file import read_fleet
 
             named = read_fleet(_FLEET_YAML, unbound=True).recordings
-    return named if named is not None and (named.is_dir() or not DEFAULT_SESSIONS.is_dir()) else DEFAULT_SESSIONS
+    places = [DEFAULT_SESSIONS] if named is None else [named, DEFAULT_SESSIONS]
+    return sorted((each for each in places if each.is_dir()), key=_changed, reverse=True) or places
+
+
+def _changed(place: Path) -> float:
+    try:
+        return place.stat().st_mtime
+    except OSError:  # removed meanwhile
+        return 0.0
 
 
 def sessions_in(place: Path) -> Iterator[Path]:
@@ -61,16 +74,18 @@ def _begun(info: SessionInfo | None, path: Path) -> tuple[str, float]:
 def find_session(session: str | os.PathLike[str], place: Path | None = None) -> Path:
     """Return the path that a name means, even if nothing is there. Raises NoLatest.
 
-    `place` is the directory of sessions.
+    `place` is the directory of sessions. Without it, a name is searched wherever `fleet up` here may have recorded.
     """
     path = Path(session)
     # `os.path.exists` is False for a path that is too long or may not be read. Opening it then gives the reason.
     if os.path.exists(path):  # noqa: PTH110
         return path
-    place = place or sessions_place()
+    places = [place] if place is not None else _places()
     match = _LATEST.fullmatch(str(session))
     if match is None:
-        return place / path if os.path.exists(place / path) else path  # noqa: PTH110
+        there = (each / path for each in places if os.path.exists(each / path))  # noqa: PTH110
+        return next(there, path)
+    place = places[0]
     found = newest_first(place)
     if not found and any(sessions_in(place)):
         raise NoLatest(f"All sessions in {place} are made of others: name one of them (`fleet sessions` lists them).")

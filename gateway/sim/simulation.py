@@ -270,11 +270,11 @@ class SimCar:
     async def _go_out(self) -> None:
         """Switch the car off, because its battery is empty, until somebody ends `link_drop`. Its link is gone, too."""
         self._is_off = True
+        await self._drop(None)  # first, as in `_brown_out`
         if isinstance(self.firmware, UgvCar):
             self.firmware.switch_off(self._loop.time())
         elif isinstance(self.firmware, Firmware):
             self.firmware.brown_out(self._loop.time())
-        await self._drop(None)
 
     async def _brown_out(self) -> None:
         if self._is_off:

@@ -2,7 +2,8 @@
 
 A recorder counts the messages that it dropped, and those that never reached it. Another recorder of the same time may
 have them. So each message of another session, within the time of a session that does not have it, makes up for one loss
-of that session. Losses of sessions that overlap may be the same messages, so of those the greatest number counts.
+of that session. Losses of sessions that overlap may be the same messages, so the result is a number that was surely
+lost, and more may be.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,37 +41,28 @@ class MergedLosses:
                 self._merged[number, key] = self._merged.get((number, key), 0) + 1
 
     def remaining(self) -> tuple[Mapping[str, int], Mapping[str, int]]:
-        """Return how many messages are still missing by key: those dropped by a recorder, and those missed by it."""
+        """Return how many messages are surely missing by key: those dropped by a recorder, and those missed by it."""
         drops: dict[str, int] = {}
         missed: dict[str, int] = {}
-        for group in self._overlapping():
-            for key in {key for number in group for key in (*self._info(number).drops, *self._info(number).missed)}:
-                left = [self._left(number, key) for number in group]
-                worst = max(left, key=sum)
-                drops[key] = drops.get(key, 0) + worst[0]
-                missed[key] = missed.get(key, 0) + worst[1]
+        for key in {key for info, _ in self._lossy.values() for key in (*info.drops, *info.missed)}:
+            drops[key], missed[key] = self._surely_lost(key)
         return _without_zeros(drops), _without_zeros(missed)
 
-    def _info(self, number: int) -> SessionInfo:
-        return self._lossy[number][0]
+    def _surely_lost(self, key: str) -> tuple[int, int]:
+        """Return the losses of those sessions that do not overlap with each other, and together lost the most."""
+        found: list[tuple[int, tuple[int, int]]] = [(-1, (0, 0))]  # the greatest losses up to a time
+        for number, (_, (begin_ns, end_ns)) in sorted(self._lossy.items(), key=lambda item: item[1][1][1]):
+            before = next(losses for until_ns, losses in reversed(found) if until_ns < begin_ns)
+            dropped, missed = self._left(number, key)
+            found.append((end_ns, max(found[-1][1], (before[0] + dropped, before[1] + missed), key=sum)))
+        return found[-1][1]
 
     def _left(self, number: int, key: str) -> tuple[int, int]:
         """Return how many dropped and missed messages of a session no other session has."""
-        info = self._info(number)
+        info, _ = self._lossy[number]
         made_up = max(0, self._merged.get((number, key), 0) - self._own.get((number, key), 0))
         dropped, missed = info.drops.get(key, 0), info.missed.get(key, 0)
         return max(0, dropped - made_up), max(0, missed - max(0, made_up - dropped))
-
-    def _overlapping(self) -> list[list[int]]:
-        """Return the sessions in groups. Sessions of different groups do not overlap in time."""
-        groups: list[list[int]] = []
-        until_ns = -1
-        for number, (_, (begin_ns, end_ns)) in sorted(self._lossy.items(), key=lambda item: item[1][1]):
-            if begin_ns > until_ns:
-                groups.append([])
-            groups[-1].append(number)
-            until_ns = max(until_ns, end_ns)
-        return groups
 
 
 def _span_ns(info: SessionInfo) -> tuple[int, int]:

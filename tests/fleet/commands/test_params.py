@@ -134,7 +134,14 @@ def test_sessions_are_where_the_fleet_file_here_records(
     place.rename(tmp_path / "elsewhere")
     for remains in (False, True):
         if remains:
-            place.mkdir()
+            (place / "20260401T000000Z-fleet").mkdir(parents=True)
+            os.utime(place, (1, 1))
         CliRunner().invoke(command, ["latest~1"])
         assert (seen[-1].parent.name, seen[-1].name) == ("elsewhere", "20260201T000000Z-fleet")
-    assert len(seen) == 3
+    # With --sim, `fleet up` records in `sessions` all the same. Each session is found by its name.
+    (place / "20260401T000000Z-fleet" / "0001.mcap").touch()
+    os.utime(place, None)
+    for name in ("latest", "20260201T000000Z-fleet"):
+        CliRunner().invoke(command, [name])
+    assert [each.parent.name for each in seen[-2:]] == ["sessions", "elsewhere"]
+    assert len(seen) == 5

@@ -130,8 +130,13 @@ def test_losses_of_two_recorders_of_one_time_count_once(whole: Session, tmp_path
     third = part_of(whole, tmp_path / "c", later, missed={key: 2})
     merge(both, tmp_path / "two")
     merge([*both, third], tmp_path / "three")
-    found = [Session(tmp_path / name).description for name in ("two", "three")]
-    assert [each and each.missed for each in found] == [{key: 2}, {key: 4}]
+    halves = [
+        part_of(whole, tmp_path / name, part, missed={key: 2}) for name, part in (("d", there[:40]), ("e", there[60:]))
+    ]
+    middle = part_of(whole, tmp_path / "f", there[30:70], missed={key: 3})
+    merge([halves[0], middle, halves[1]], tmp_path / "chain")
+    found = [Session(tmp_path / name).description for name in ("two", "three", "chain")]
+    assert [each and each.missed for each in found] == [{key: 2}, {key: 4}, {key: 4}]
 
 
 def test_part_has_only_losses_that_may_be_in_it(whole: Session, tmp_path: Path) -> None:
