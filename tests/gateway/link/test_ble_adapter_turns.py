@@ -174,8 +174,8 @@ async def test_full_ble_adapter_is_reported(peer: BlePeer) -> None:
     hci0.slots = 3
     more(peer, 3, hci0)
     assert await refused(peer.url) == (
-        f"{peer.url}: the Bluetooth adapter is full: hci0 has 3 connections, and most can hold 5, some 3. End this "
-        "car's link with ?adapter=hci1 or ?adapter=auto"
+        f"{peer.url}: the Bluetooth adapter is full: hci0 has 3 connections, and most can hold 5, some 3. Add "
+        "?adapter=hci1 or ?adapter=auto to this car's link"
     )
     more(peer, 5, hci1)
     assert "is full: hci" in await refused(BleUrl(peer.module.address, adapter="auto"))

@@ -275,4 +275,4 @@ def test_replan_accepts_other_plan_name_in_fleet_file(tmp_path: Path) -> None:
     other.write_text(text, encoding="utf-8")
     named = run("plan", "try", tmp_path, "--fleet-file", other)
     assert named.exit_code == 2
-    assert "file 'p2.yaml'" in named.output
+    assert f"there is no file {tmp_path / 'p2.yaml'}" in named.output
