@@ -15,7 +15,6 @@ from types import TracebackType
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from fleet.client import client
-from fleet.client.client import closed_error
 from fleet.client.commands import (
     CarCommands,
     CommandRequest,
@@ -139,7 +138,7 @@ class Fleet:
                         return reading
         except TimeoutError:
             raise waiting.timeout_error(key_expression, timeout_s or 0.0, datetime.now(UTC)) from None
-        raise closed_error()
+        raise client.closed_error()
 
     async def publish_pose(
         self,

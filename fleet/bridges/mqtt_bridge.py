@@ -87,8 +87,7 @@ class MqttBridge:
     async def run(self) -> None:
         """Publish until a signal ends the process.
 
-        Raises BrokerRefused, but only at the first attempt to connect. Later, a refusal is taken for a broker that is
-        away.
+        Raises BrokerRefused, but only at the first attempt to connect. After a later refusal, the bridge tries again.
         """
         ended = asyncio.Event()
         signals.calls_in(asyncio.get_running_loop(), lambda _: ended.set())

@@ -104,9 +104,10 @@ def _show_session(path: Path, car: str, *, as_json: bool) -> None:
     if car and car not in checkup.cars:
         near = did_you_mean(car, checkup.cars) or f"Cars: {', '.join(sorted(checkup.cars))}."
         raise click.ClickException(f'No car "{car}" in {session.name}. {near}')
-    findings = list(checkup.findings(verdict, typed_name(session)))
+    name = typed_name(session)
+    findings = list(checkup.findings(verdict, name))
     if as_json:
-        click.echo(json.dumps(checkup.as_dict(verdict, typed_name(session))))
+        click.echo(json.dumps(checkup.as_dict(verdict, name)))
     else:
         echo_safely(_first_line(session.name, findings))
         _show(findings, checkup.facts(verdict))

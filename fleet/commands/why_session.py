@@ -18,7 +18,6 @@ from fleet.recording.tools.car_timeline import (
     TIMELINE_BEFORE_NS,
     TIMELINE_TOPICS,
     CarTimeline,
-    message_time_ns,
 )
 from fleet.recording.tools.moment import known_message
 from fleet.recording.tools.recorder_clock import RecorderClock
@@ -60,8 +59,7 @@ def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
         if each is not None:
             key = each.key
             topic = f"{key.car}/{key.topic}" if key.car.startswith("@") else key.topic
-            stamp_ns = message_time_ns(each.message, each.publish_ns)
-            timeline.add(topic, each.message, recorder_clock.at_ns(key.car, stamp_ns, each.log_ns))
+            timeline.add(topic, each.message, recorder_clock.time_ns(each))
     if as_json:
         click.echo(json.dumps(timeline.as_dict()))
         return

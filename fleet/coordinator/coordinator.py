@@ -171,6 +171,7 @@ class Coordinator:
         by = self.client.sender.removeprefix(SENDER)
         self._memory, _ = on_request(PlanRequest.STOP, self.plan, self._memory, by, began)
         self._memory = replace(self._memory, to_rest=self._memory.to_rest | self._sent_off)
+        self._save(self._memory)  # also if no step follows, because the hub is gone
         cars = sorted(self._memory.to_rest)
         while True:
             now, link = time.monotonic(), bus.link
@@ -223,8 +224,12 @@ class Coordinator:
         self._publications.forget(gone)
         self._commands.forget(gone)
         for decision in result.decisions:
-            if decision.car is not None and decision.mode is not None and self._persisted is None:
-                (self._sent_off.discard if decision.mode is Mode.MANUAL else self._sent_off.add)(decision.car)
+            if decision.car is None or decision.mode is None or self._persisted is not None:
+                continue
+            if decision.mode is Mode.MANUAL:
+                self._sent_off.discard(decision.car)
+            else:
+                self._sent_off.add(decision.car)
         since_s = time.time() - now
         for decision in (*result.changed, *result.reworded):
             self._publications.publish("decision", decision_message(decision, since_s + decision.since))
@@ -242,11 +247,9 @@ class Coordinator:
         kept = memory if self._persisted is None else self._persisted
         return self._state_file.save(to_persisted(self.plan, kept, time.monotonic(), time.time()))
 
-    def _check_sender(self, observer: FleetObserver, by: str) -> None:
+    def _check_request(self, observer: FleetObserver, by: str) -> None:
+        """Raise RequestRefused if the sender may not change the plan, or if this coordinator is ending."""
         check_sender(observer.people if self.people is None else self.people, by)
-
-    def _check_running(self) -> None:
-        """Raise RequestRefused if this coordinator brings its cars to rest because it ends."""
         if self._persisted is not None:
             raise RequestRefused("This coordinator is ending. `fleet plan run` starts another one.")
 
@@ -254,8 +257,7 @@ class Coordinator:
         """Carry out a request for the plan in force. Persist the state and publish an event before the reply."""
         try:
             by = sender_of(query, "fleet.v1.PlanCommand")
-            self._check_sender(observer, by)
-            self._check_running()
+            self._check_request(observer, by)
             memory, words = on_request(request, self.plan, self._memory, by, time.monotonic())
         except RequestRefused as refused:
             reply_result(query, rejected(refused))
@@ -284,8 +286,7 @@ class Coordinator:
         result = pb.Result(status=Phase.SENT)
         try:
             text, by = plan_command(query)
-            self._check_sender(observer, by)
-            self._check_running()
+            self._check_request(observer, by)
             plan = parse(text)
         except RequestRefused as refused:
             result = rejected(refused)

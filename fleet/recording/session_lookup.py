@@ -83,7 +83,7 @@ def find_session(session: str | os.PathLike[str], place: Path | None = None) -> 
     places = [place] if place is not None else _places()
     match = _LATEST.fullmatch(str(session))
     if match is None:
-        there = (each / path for each in places if os.path.exists(each / path))  # noqa: PTH110
+        there = (each / path for each in places if os.path.exists(each / path))  # noqa: PTH110 - as above
         return next(there, path)
     place = places[0]
     found = newest_first(place)

@@ -110,7 +110,7 @@ def cut(
 
     def is_chosen(key: str) -> bool:
         car = car_of(key)
-        return (not names or car in names or car.startswith("@")) and selection.has_key(key)
+        return not names or car in names or car.startswith("@")
 
     def part() -> Iterator[Row]:
         return (row for row in session.rows(selection) if is_chosen(row[0].channel.topic))
@@ -125,9 +125,12 @@ def cut(
         made = _described(session, new, count, about, selection)
         # The recorder has counted its losses for the whole session. In a part of that time, `verify` finds those that
         # are inside by the numbers of the messages.
-        kept = is_chosen if bounds == [None, None] else lambda _key: False
-        drops, missed = ({key: lost for key, lost in each.items() if kept(key)} for each in (made.drops, made.missed))
-        replace(made, drops=drops, missed=missed).write(new)
+        is_whole_time = bounds == [None, None]
+        made.drops, made.missed = (
+            {key: lost for key, lost in each.items() if is_whole_time and is_chosen(key) and selection.has_key(key)}
+            for each in (made.drops, made.missed)
+        )
+        made.write(new)
         _copy_others(session, new)
     return count
 
@@ -183,9 +186,10 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
         origin = {**made.origin, "of": about["of"], "lost": lost, "missing": None if lost else 0}
         kept = any(each.kept for each in described)
         drops, missed = losses.remaining()
+        recovered = dict(sum((Counter(each.recovered) for each in described), Counter[str]()))
         made = replace(made, marks=marks, pins=pins, kept=kept, started=started, origin=origin)
-        recovered = sum((Counter(each.recovered) for each in described), Counter[str]())
-        replace(made, drops=drops, missed=missed, recovered=dict(recovered)).write(new)
+        made.drops, made.missed, made.recovered = drops, missed, recovered
+        made.write(new)
         _copy_others(sessions[0], new)
     return count, twice, lost
 

@@ -7,6 +7,9 @@ difference of the last messages is taken for the error alone.
 
 from typing import Final
 
+from fleet.recording.tools.car_timeline import message_time_ns
+from fleet.recording.tools.moment import Known
+
 WINDOW_NS: Final = 30_000_000_000
 """Length of a window of the recorder's clock, in ns. The differences of this window and of the one before count, so
 that a step of a clock no longer matters after two windows."""
@@ -18,6 +21,10 @@ class RecorderClock:
     def __init__(self) -> None:
         self._smallest: dict[str, tuple[int, int, int]] = {}
         """The window of the last message, the smallest difference in it, and that of the window before."""
+
+    def time_ns(self, known: Known) -> int:
+        """Return when a message was stamped, or published if it has no stamp, by the recorder's clock."""
+        return self.at_ns(known.key.car, message_time_ns(known.message, known.publish_ns), known.log_ns)
 
     def at_ns(self, publisher: str, stamp_ns: int, log_ns: int) -> int:
         """Return when a message was stamped, by the recorder's clock. `log_ns` is when the recorder received it."""

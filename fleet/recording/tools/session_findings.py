@@ -9,7 +9,6 @@ from msgspec import Struct, field, to_builtins
 from fleet.client.diagnosis import DoctorFinding
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.stop_count import stops_cars
-from fleet.recording.tools.car_timeline import message_time_ns
 from fleet.recording.tools.moment import known_message
 from fleet.recording.tools.recorder_clock import RecorderClock
 from fleet.recording.tools.stop_findings import (
@@ -53,8 +52,7 @@ class SessionCheckup(Struct):
             if key is not None and key.topic in WATCHED_TOPICS and self.car in ("", key.car):
                 known = known_message(row)
                 if known is not None:
-                    stamp_ns = message_time_ns(known.message, known.publish_ns)
-                    self.add(key.car, key.topic, known.message, self._clock.at_ns(key.car, stamp_ns, known.log_ns))
+                    self.add(key.car, key.topic, known.message, self._clock.time_ns(known))
             yield row
 
     def add(self, car: str, topic: str, message: Any, at_ns: int) -> None:

@@ -54,7 +54,7 @@ class PlannedQuery(Struct, frozen=True):
 
 
 class _Asked(Struct):
-    """A source to ask. Without `due`, it is asked again at the next gap or reconnect."""
+    """A source to ask. Without `due`, the recorder asks it again at the next gap or reconnect."""
 
     due: list[tuple[float, float]] = field(default_factory=list)
     """When to ask, and since when messages may be missing."""

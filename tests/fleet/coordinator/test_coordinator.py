@@ -71,6 +71,14 @@ def truth(cars: Cars, car: str) -> str:
     return str(cars.sim.say({"car": car, "ask": "truth"})["mode"])
 
 
+def tracking(cars: Cars, path: Path) -> Lines:
+    """Start a plan, and wait until its car tracks. Return the further decisions."""
+    lines = Lines(coordinator(cars, path, "fixed: {red: {mode: tracking}}"))
+    lines.until("red", "tracking", "role tracking")
+    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    return lines
+
+
 def test_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> None:
     seen: list[bus.Sample] = []
     cars.bus.subscribe("fleet/@coordinator/**", seen.append)
@@ -128,10 +136,8 @@ def test_plan_is_kept_but_never_against_a_hold(cars: Cars, tmp_path: Path) -> No
 
 
 def test_car_with_lost_link_is_left_alone_and_restored_to_mode(cars: Cars, tmp_path: Path) -> None:
-    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
-    lines = Lines(process)
-    lines.until("red", "tracking", "role tracking")
-    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    lines = tracking(cars, tmp_path / "plan.yaml")
+    process = lines.process
     cars.sim.say({"car": "red", "fault": "link_drop"})
     lost = lines.until("red", None, "the link of red is lost")
     assert "link is back" in lost["would_change"]
@@ -370,25 +376,18 @@ def test_successor_of_killed_coordinator_switches_no_mode(cars: Cars, tmp_path: 
     assert (truth(cars, "red"), driving(cars.sim, "red")) == ("manual", False)
 
 
-def tracking(cars: Cars, path: Path) -> GatewayProcess:
-    """Start a plan, and wait until its car tracks."""
-    process = coordinator(cars, path, "fixed: {red: {mode: tracking}}")
-    Lines(process).until("red", "tracking", "role tracking")
-    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
-    return process
-
-
 def test_second_signal_at_once_does_not_take_back_the_stop(cars: Cars, tmp_path: Path) -> None:
-    process = tracking(cars, tmp_path / "plan.yaml")
+    process = tracking(cars, tmp_path / "plan.yaml").process
     os.kill(process.pid, signal.SIGINT)
     process.end(signal.SIGINT)
     wait_for(lambda: truth(cars, "red") == "manual" and not driving(cars.sim, "red"), "red stands")
 
 
 def test_end_waits_for_a_link_that_is_gone(cars: Cars, tmp_path: Path) -> None:
-    process = tracking(cars, tmp_path / "plan.yaml")
+    lines = tracking(cars, tmp_path / "plan.yaml")
+    process = lines.process
     cars.sim.say({"car": "red", "fault": "link_drop"})
-    Lines(process).until("red", None, "the link of red is lost")
+    lines.until("red", None, "the link of red is lost")
     os.kill(process.pid, signal.SIGINT)
     wait_for(lambda: any(each.stopped_by for each in cars.get("fleet/@coordinator/assignment")), "it stops the plan")
     cars.sim.say({"car": "red", "fault": "link_drop", "for_s": 0})
@@ -397,9 +396,10 @@ def test_end_waits_for_a_link_that_is_gone(cars: Cars, tmp_path: Path) -> None:
 
 
 def test_car_whose_gateway_is_gone_at_the_end_is_named(cars: Cars, tmp_path: Path) -> None:
-    process = tracking(cars, tmp_path / "plan.yaml")
+    lines = tracking(cars, tmp_path / "plan.yaml")
+    process = lines.process
     cars.gateways["red"].kill()
-    Lines(process).until("red", None, "not on the bus")
+    lines.until("red", None, "not on the bus")
     os.kill(process.pid, signal.SIGINT)
     wait_for(lambda: any(each.stopped_by for each in cars.get("fleet/@coordinator/assignment")), "it stops the plan")
     assert process.end(signal.SIGINT) == 1
@@ -424,10 +424,8 @@ def test_role_goes_to_another_car_when_a_gateway_dies(cars: Cars, tmp_path: Path
 
 
 def test_car_that_does_not_react_at_the_end_is_named_and_next_ctrl_c_ends_at_once(cars: Cars, tmp_path: Path) -> None:
-    process = coordinator(cars, tmp_path / "plan.yaml", "fixed: {red: {mode: tracking}}")
-    lines = Lines(process)
-    lines.until("red", "tracking", "role tracking")
-    wait_for(lambda: truth(cars, "red") == "tracking", "red tracks")
+    lines = tracking(cars, tmp_path / "plan.yaml")
+    process = lines.process
     cars.sim.say({"car": "red", "fault": "deaf"})
     try:
         os.kill(process.pid, signal.SIGINT)

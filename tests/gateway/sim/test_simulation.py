@@ -183,6 +183,18 @@ async def driven(simulation: Simulation, car: str) -> tuple[str, int, asyncio.St
     return host, port, writer
 
 
+async def until_open(host: str, port: int, patience_s: float = PATIENCE) -> None:
+    """Wait until a port accepts connections. Nothing else tells when it does."""
+    end = time.monotonic() + patience_s
+    while True:
+        with contextlib.suppress(ConnectionError):
+            _, writer = await asyncio.open_connection(host, port)
+            writer.close()
+            return
+        assert time.monotonic() < end
+        await asyncio.sleep(0.05)
+
+
 async def test_raspberry_pi_program_dies_with_its_link(pair: Simulation) -> None:
     host, port, writer = await driven(pair, "blue")
     await pair.inflict(Fault(FaultKind.LINK_DROP, "blue", for_s=0.1))
@@ -194,18 +206,7 @@ async def test_raspberry_pi_program_dies_with_its_link(pair: Simulation) -> None
     await pair.inflict(Fault(FaultKind.BROWNOUT, "blue"))
     assert not pair.cars["blue"].truth.driving
 
-    async def back() -> bool:
-        try:
-            _, again = await asyncio.open_connection(host, port)
-        except ConnectionError:
-            return False
-        again.close()
-        return True
-
-    end = time.monotonic() + PATIENCE
-    while not await back():
-        assert time.monotonic() < end
-        await asyncio.sleep(0.05)
+    await until_open(host, port)
     writer.close()
 
 
@@ -656,18 +657,7 @@ async def test_brownout_restarts_course_program_with_its_port() -> None:
         writer.write(b"$4WD,MODE00#")
         await until(lambda: not simulation.cars["c"].truth.alive, "dies")
         await simulation.inflict(Fault(FaultKind.BROWNOUT, "c"))
-
-        async def answers() -> bool:
-            try:
-                _, again = await asyncio.open_connection(host, port)
-            except ConnectionError:
-                return False
-            again.close()
-            return True
-
-        async with asyncio.timeout(PI_BOOT_S + 5.0):
-            while not await answers():  # noqa: ASYNC110 - nothing tells when the port opens
-                await asyncio.sleep(0.05)
+        await until_open(host, port, PI_BOOT_S + 5.0)
         writer.close()
     finally:
         await simulation.stop()
