@@ -368,9 +368,11 @@ class UgvCar:
 
     def _measured(self, side: int) -> float:
         """Return the speed that an encoder measures. Without it, the speed is 0, and a closed loop raises the duty."""
-        if not self._build.has_encoders or ("no_encoder" in self._options and side == 0):
-            return 0.0
-        return self._sign * round(self._wheels[side], 3)
+        return self._sign * round(self._wheels[side], 3) if self._has_signal(side) else 0.0
+
+    def _has_signal(self, side: int) -> bool:
+        """Return True if the encoder of this side counts."""
+        return self._build.has_encoders and not ("no_encoder" in self._options and side == 0)
 
     @property
     def _sign(self) -> int:
@@ -397,7 +399,8 @@ class UgvCar:
             self._wheels[side] += FOLLOW * (wanted - self._wheels[side])
             if abs(self._wheels[side] - wanted) < 0.002:
                 self._wheels[side] = wanted
-            self._odometer[side] += abs(self._wheels[side]) * LOOP_S
+            if self._has_signal(side):
+                self._odometer[side] += abs(self._wheels[side]) * LOOP_S
         pwm = [round(255 * each / TOP_SPEED_M_S) for each in self._wheels]
         self._body.drive(now, pwm[0], pwm[1])
         armed = self._dead_man_s >= 0.0 and not self._timed_out and not self._unguarded

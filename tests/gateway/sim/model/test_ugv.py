@@ -107,6 +107,13 @@ def test_without_encoders_the_speeds_are_nothing_or_the_command() -> None:
     assert (host.feedback()["L"], host.car.moving) == (0, True)
 
 
+def test_loose_encoder_counts_neither_speed_nor_distance() -> None:
+    host = Host("ugv_rover", "no_encoder").send(FORWARD).run(1.0)
+    assert host.car.moving
+    assert (host.feedback()["L"], host.feedback()["odl"]) == (0, 0)
+    assert host.feedback()["odr"] > 0
+
+
 def test_ugv_poll_within_stream_gap_has_no_answer() -> None:
     host = Host("wave_rover").send('{"T":142,"cmd":1000}\n', '{"T":130}\n')
     host.heard = b""
