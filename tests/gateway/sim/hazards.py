@@ -237,7 +237,7 @@ async def half_then_stop(car: Stranger) -> None:
     assert car.truth.driving
 
 
-@hazard("half a general frame, then MODE00")
+@hazard("half a general frame, then MODE00: it opens mode 4 behind 8 bytes")
 async def half_then_mode(car: Stranger) -> None:
     await drive(car)
     await car.write(b"$1,0,0,0")
@@ -246,6 +246,35 @@ async def half_then_mode(car: Stranger) -> None:
     await car.until(lambda truth: truth.mode == "color_led")
     await car.wait(1.0)
     assert car.truth.driving
+
+
+@hazard("half a general frame, then MODE00: it opens mode 0 behind other halves")
+async def half_then_mode_0(car: Stranger) -> None:
+    await drive(car)
+    await car.write(b"$1,0,0,0,0")
+    await car.wait(0.1)
+    await car.write(MODE00)
+    await car.wait(1.5)
+    assert car.truth.blocked
+    await awake(car)
+    assert car.truth.driving
+    assert car.truth.mode == "manual"
+
+
+def _digitless(frame: bytes) -> None:
+    @hazard(f"a MODE frame that lost one digit or both ({frame.decode()})")
+    async def digitless(car: Stranger) -> None:
+        await drive(car)
+        await car.write(frame)
+        await car.wait(1.8)
+        assert car.truth.blocked
+        await awake(car)
+        assert car.truth.driving
+        assert car.truth.mode == "manual"
+
+
+for _frame in (b"$4WD,MODE0#", b"$4WD,MODE#"):
+    _digitless(_frame)
 
 
 @hazard("a lone # ends a half frame, whose motion is then obeyed")

@@ -247,6 +247,33 @@ def half_general(pair: Pair) -> None:
         recovers(pair)
 
 
+@ours("a MODE frame that lost one digit or both (")
+def digitless(pair: Pair) -> None:
+    """Lose the digits of the first `MODE00` of a stop. Require that the stop ends only when the motors are off."""
+    for lost in (b"0", b"00"):
+        driving(pair)
+        pair.car.feed = lose_once(pair, lost)  # type: ignore[method-assign]
+        pair.ask(Stop(), verb="stop", identity="the-stop")
+        pair.until(lambda: pair.last_of("the-stop") is not None, 30.0)
+        pair.pass_frames()
+        last = pair.last_of("the-stop")
+        assert last is not None
+        assert (last.phase, last.basis) == (Phase.COMPLETE, Basis.SHOWN)
+        assert pair.off_for_good_at() < pair.now
+        pair.records.clear()
+
+
+def lose_once(pair: Pair, lost: bytes) -> Callable[[bytes, float], None]:
+    """Return the car's end of a wire that loses these bytes of the next `MODE00`."""
+    feed, left = pair.car.feed, [lost]
+
+    def deliver(data: bytes, now: float) -> None:
+        is_hit = bool(left) and data == b"$4WD,MODE00#"
+        feed(data.replace(left.pop(), b"", 1) if is_hit else data, now)
+
+    return deliver
+
+
 @ours("a lone # with nothing pending acts as a stop in mode 0")
 def lone_hash(pair: Pair) -> None:
     """Require that only recovery writes a lone `#`, since recovery stops the car anyway."""
