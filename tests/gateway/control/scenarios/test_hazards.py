@@ -252,7 +252,7 @@ def digitless(pair: Pair) -> None:
     """Lose the digits of the first `MODE00` of a stop. Require that the stop ends only when the motors are off."""
     for lost in (b"0", b"00"):
         driving(pair)
-        pair.car.feed = lose_once(pair, lost)  # type: ignore[method-assign]
+        lose_once(pair, lost)
         pair.ask(Stop(), verb="stop", identity="the-stop")
         pair.until(lambda: pair.last_of("the-stop") is not None, 30.0)
         pair.pass_frames()
@@ -263,15 +263,15 @@ def digitless(pair: Pair) -> None:
         pair.records.clear()
 
 
-def lose_once(pair: Pair, lost: bytes) -> Callable[[bytes, float], None]:
-    """Return the car's end of a wire that loses these bytes of the next `MODE00`."""
+def lose_once(pair: Pair, lost: bytes) -> None:
+    """Lose these bytes of the next `MODE00`."""
     feed, left = pair.car.feed, [lost]
 
     def deliver(data: bytes, now: float) -> None:
         is_hit = bool(left) and data == b"$4WD,MODE00#"
         feed(data.replace(left.pop(), b"", 1) if is_hit else data, now)
 
-    return deliver
+    pair.car.feed = deliver  # type: ignore[method-assign]
 
 
 @ours("a lone # with nothing pending acts as a stop in mode 0")
