@@ -178,11 +178,15 @@ class YahboomDriver(Executor):
     def _already_too_fast(self) -> str | None:
         """Return why the car may not be driven at its present speed, or None. Cars begin at a speed of their own."""
         speed, maximum, car = self.model.profile.speed, self.desk.speed_max, self.desk.car
-        share, slowest = speed.fraction(self.model.believed.speed), speed.fraction(speed.low)
+        believed = self.model.believed
+        share, slowest = speed.fraction(believed.speed), speed.fraction(believed.slowest)
         if share <= maximum:
             return None
         advice = f"`fleet speed {car} down` lowers it." if slowest <= maximum else f"Its slowest is {slowest:.0%}."
-        return f"{car} drives at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max). {advice}"
+        drives = f"drives at about {share:.0%} of full speed"
+        if believed.speed_is_bound:
+            drives = f"may drive at up to {share:.0%} of full speed, because a mode has set its speed"
+        return f"{car} {drives}. Its maximum is {maximum:.0%} (speed_max). {advice}"
 
     def frames(self, what: Action) -> tuple[Frame | Later, ...]:
         """Return the frames of an action on a part of the car. Leave out those that the car does not understand."""

@@ -897,6 +897,20 @@ def test_believed_fan_and_speed_match_simulated_car() -> None:
         assert pair.car.truth.speed == pair.control.driver.model.believed.speed
 
 
+def test_speed_that_a_mode_has_set_is_not_exceeded_by_the_estimate() -> None:
+    pair = Pair(start_s=2.0).ready()
+    assert pair.car.truth.speed == pair.control.driver.model.believed.speed
+    pair.ask(SetMode(Mode.LIGHT_SEEKING))
+    pair.run(8.0)
+    pair.ask(SetMode(Mode.MANUAL))
+    pair.run(8.0)
+    assert pair.car.truth.speed == 200
+    for _ in range(4):
+        assert pair.car.truth.speed <= pair.control.driver.model.believed.speed
+        pair.ask(ChangeSpeed(SpeedStep.DOWN))
+        pair.run(0.5)
+
+
 @pytest.mark.parametrize(("platform", "heard"), [("unknown", False), ("arduino", False), ("raspberry_pi", True)])
 def test_car_without_readings_gets_advice(platform: str, *, heard: bool) -> None:
     desk = Workbench(platform)

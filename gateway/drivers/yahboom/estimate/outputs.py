@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 from msgspec.structs import replace
 
-from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
+from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.platforms import Profile
-from schemas.words import Motion
+from schemas.words import Motion, SpeedStep
 
 
 @dataclass(slots=True)
@@ -30,6 +30,9 @@ class StateEstimate:
     servo_deg: int | None = None
     led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
     speed: float = field(init=False)
+    """In the unit of the car (see `SpeedModel`)."""
+    speed_is_bound: bool = False
+    """True if the car may be slower than `speed`, because a mode has set its speed."""
 
     def __post_init__(self) -> None:
         self.speed = self.profile.speed.start
@@ -42,7 +45,7 @@ class StateEstimate:
                     self.repeat = self.repeat or frame.motion is not self.motion
                 self.motion = frame.motion
                 if frame.speed is not None:
-                    self.speed = self.profile.speed.step(self.speed, frame.speed)
+                    self._step(frame.speed)
                 if self.profile.fan_is_level:
                     self.fan_at = now if frame.fan is not self.fan else self.fan_at
                     self.fan = frame.fan
@@ -52,12 +55,25 @@ class StateEstimate:
                     self.fan_toggled = True
             case ModeClose():
                 self.motion = Motion.STOP
+            case ModeOpen(mode) if mode in self.profile.speed.set_by:
+                self.speed, self.speed_is_bound = self.profile.speed.top, True
             case Ptz(deg):
                 self.servo_deg = deg
             case ColorLed():
                 self.led = frame
             case _:
                 pass
+
+    def _step(self, step: SpeedStep) -> None:
+        self.speed = max(self.profile.speed.step(self.speed, step), self.slowest if self.speed_is_bound else 0.0)
+
+    @property
+    def slowest(self) -> float:
+        """Return the lowest value that steps down give `speed`.
+
+        If the speed is not known, a step down may have led to `rebound`, and the next one below it, and so on.
+        """
+        return self.profile.speed.rebound if self.speed_is_bound else self.profile.speed.low
 
     @property
     def fan_may_run(self) -> bool:

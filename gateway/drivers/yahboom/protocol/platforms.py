@@ -60,13 +60,15 @@ _HORIZONTAL: Final = frozenset(
 
 
 class SpeedModel(Struct, frozen=True):
-    """The gateway's estimate of the speed, by counting steps, in the car's own unit."""
+    """What is known of the speed, in the car's own unit. The gateway counts the steps."""
 
     start: float
     increment: float
     low: float  # a step down to less than this ends at `rebound`
     rebound: float
     top: float
+    set_by: frozenset[Mode]
+    """Modes that may leave the car at any speed."""
 
     def step(self, value: float, step: SpeedStep) -> float:
         """Return the speed after one step."""
@@ -80,12 +82,19 @@ class SpeedModel(Struct, frozen=True):
         return min(max(value / self.top, 0.0), 1.0)
 
 
+# In this mode, a person changes the speed with an infrared remote.
+_BY_PERSON: Final = frozenset({Mode.REMOTE_CONTROL})
+# The Arduino program sets the speed itself in these modes, and keeps it afterwards.
+_BY_PROGRAM: Final = frozenset({Mode.TRACKING, Mode.OBSTACLE_AVOIDANCE, Mode.LIGHT_SEEKING, Mode.FOLLOWING})
 # platforms: speed. Arduino 150 of 255, +-50, ceiling 255, a step down to less than 50 becomes 100
-ARDUINO_SPEED: Final = SpeedModel(start=150, increment=50, low=50, rebound=100, top=255)
+ARDUINO_SPEED: Final = SpeedModel(
+    start=150, increment=50, low=50, rebound=100, top=255, set_by=_BY_PERSON | _BY_PROGRAM
+)
 # programs that people have: 200 of 1000, steps of 100. The slowest speed was not measured: one step is assumed
-STM32_SPEED: Final = SpeedModel(start=200, increment=100, low=100, rebound=100, top=1000)
-# platforms: speed. Raspberry Pi +-20 in 20..100 %; the docs have no start value: half of full speed is assumed
-RASPBERRY_PI_SPEED: Final = SpeedModel(start=50, increment=20, low=20, rebound=20, top=100)
+STM32_SPEED: Final = SpeedModel(start=200, increment=100, low=100, rebound=100, top=1000, set_by=_BY_PERSON)
+# platforms: speed. Raspberry Pi +-20 in 20..100 %. The start is 80 % in one program and 50 % in another. The faster one
+# is assumed, so that no car exceeds `speed_max`
+RASPBERRY_PI_SPEED: Final = SpeedModel(start=80, increment=20, low=20, rebound=20, top=100, set_by=frozenset())
 
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters
 _PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0

@@ -3,8 +3,10 @@
 import pytest
 
 from gateway.control.commands import ChangeSpeed, Drive
+from gateway.drivers.yahboom.estimate.outputs import StateEstimate
+from gateway.drivers.yahboom.protocol.frames import General, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from schemas.words import Motion, SpeedStep
+from schemas.words import Mode, Motion, SpeedStep
 from tests.support.controls import control
 
 
@@ -16,7 +18,7 @@ from tests.support.controls import control
         ("arduino", 150.0, SpeedStep.UP, 0.79, False),
         ("arduino", 150.0, SpeedStep.DOWN, 0.1, False),
         ("arduino", 50.0, SpeedStep.DOWN, 0.3, True),  # docs/reference/protocol.md#platforms: that step goes up, to 100
-        ("raspberry_pi", 50.0, SpeedStep.UP, 0.6, True),
+        ("raspberry_pi", 60.0, SpeedStep.UP, 0.7, True),
     ],
 )
 def test_no_step_beyond_the_speed_that_is_allowed(
@@ -31,7 +33,7 @@ def test_no_step_beyond_the_speed_that_is_allowed(
 
 @pytest.mark.parametrize(
     ("platform", "limit", "steps_down"),
-    [("arduino", 0.59, 0), ("arduino", 0.5, 1), ("arduino", 0.2, 2), ("stm32", 0.2, 0), ("raspberry_pi", 0.3, 1)],
+    [("arduino", 0.59, 0), ("arduino", 0.5, 1), ("arduino", 0.2, 2), ("stm32", 0.2, 0), ("raspberry_pi", 0.3, 3)],
 )
 def test_no_drive_beyond_the_speed_that_is_allowed(platform: str, limit: float, steps_down: int) -> None:
     driver = control(parse_platform(platform), speed_max=limit).driver
@@ -48,3 +50,30 @@ def test_stop_is_never_too_fast() -> None:
     driver = control(parse_platform("arduino"), speed_max=0.1).driver
     assert driver.refusal(Drive(Motion.FORWARD)) is not None
     assert driver.refusal(Drive(Motion.STOP)) is None
+
+
+@pytest.mark.parametrize(("limit", "steps_down"), [(1.0, 0), (0.6, 3), (0.4, 4)])
+def test_speed_that_a_mode_has_set_is_lowered_before_a_drive(limit: float, steps_down: int) -> None:
+    driver = control(parse_platform("arduino"), speed_max=limit).driver
+    believed = driver.model.believed
+    believed.on_written(ModeOpen(Mode.TRACKING), 0.0)
+    for _ in range(steps_down):
+        assert driver.refusal(Drive(Motion.FORWARD)) is not None
+        assert driver.refusal(ChangeSpeed(SpeedStep.DOWN)) is None
+        believed.on_written(General(Motion.STOP, speed=SpeedStep.DOWN), 0.0)
+    assert driver.refusal(Drive(Motion.FORWARD)) is None
+
+
+@pytest.mark.parametrize("platform", ["arduino", "stm32"])
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.MANUAL])
+def test_car_is_never_faster_than_believed(platform: str, mode: Mode) -> None:
+    """Whatever a mode has left, each step down keeps the estimate at or above the car's speed."""
+    speed = parse_platform(platform).speed
+    left = range(int(speed.top) + 1) if mode in speed.set_by else [speed.start]
+    for true_speed in left:
+        believed, true = StateEstimate(parse_platform(platform)), float(true_speed)
+        believed.on_written(ModeOpen(mode), 0.0)
+        for step in [SpeedStep.DOWN] * 7 + [SpeedStep.UP, SpeedStep.DOWN, SpeedStep.DOWN]:
+            assert true <= believed.speed
+            believed.on_written(General(Motion.STOP, speed=step), 0.0)
+            true = speed.step(true, step)
