@@ -81,17 +81,11 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
         return Rejected(raw, at, Cause.OUT_OF_RANGE)
     firmware = firmware_of(found, _number(found, "v") or 0.0)
     has_arm = not _OF_ARM.isdisjoint(found)
-    return Feedback(
-        raw,
-        at,
-        firmware,
-        left,
-        right,
-        _voltage(found, firmware),
-        _tuple(found, ("r", "p", "y"), math.radians(1.0)) if firmware is UgvFirmware.GENERAL and not has_arm else None,
-        _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None,
-        _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS and not has_arm else None,
-    )
+    has_attitude = firmware is UgvFirmware.GENERAL and not has_arm
+    attitude = _tuple(found, ("r", "p", "y"), math.radians(1.0)) if has_attitude else None
+    odometer = _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None
+    imu = _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS and not has_arm else None
+    return Feedback(raw, at, firmware, left, right, _voltage(found, firmware), attitude, odometer, imu)
 
 
 def _voltage(found: dict[str, Any], firmware: UgvFirmware | None) -> float | None:

@@ -23,10 +23,7 @@ class Chassis(Struct, frozen=True):
 PLATFORMS: Final[dict[str, dict[UgvFirmware, Chassis]]] = {
     "wave_rover": {UgvFirmware.GENERAL: Chassis(1, has_encoders=False)},
     "ugv01": {UgvFirmware.GENERAL: Chassis(3, has_encoders=True)},
-    "ugv02": {
-        UgvFirmware.GENERAL: Chassis(2, has_encoders=False),
-        UgvFirmware.ROS: Chassis(2, has_encoders=True),
-    },
+    "ugv02": {UgvFirmware.GENERAL: Chassis(2, has_encoders=False), UgvFirmware.ROS: Chassis(2, has_encoders=True)},
     "ugv_rover": {UgvFirmware.ROS: Chassis(2, has_encoders=True)},
     "ugv_beast": {UgvFirmware.ROS: Chassis(3, has_encoders=True)},
 }
