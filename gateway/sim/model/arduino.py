@@ -22,6 +22,8 @@ STRING_LIMIT: Final = 512
 START_SPEED: Final = 150
 OPEN_S: Final = 2.0
 BEEP_S: Final = 0.1
+LIGHT_TURN_S: Final = 0.107
+"""Duration of one loop turn in light seeking: the measured interval of its reports."""
 
 
 class ArduinoCar(ModeCar):
@@ -216,6 +218,11 @@ class ArduinoCar(ModeCar):
             yield Wait(self._now + len(frame) / self._rate)
         else:
             yield from self._print(frame)
+
+    def _light_seeking(self) -> Program:
+        began = self._now
+        yield from super()._light_seeking()
+        yield Wait(max(self._now, began + LIGHT_TURN_S))
 
 
 def _field(text: str, word: str) -> int | None:

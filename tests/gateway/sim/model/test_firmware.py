@@ -112,7 +112,7 @@ async def frames(car: VirtualStranger, seconds: float) -> bytes:
 
 FILLER = [
     (2, rb"\$4WD,CSB0,PV8,GS0,LF[01]{4},HW00,GM00#", 27),
-    (5, rb"\$4WD,CSB120,PV8\.3,GS000,LF0000,HW00,GM[01]{2}#", 23),
+    (5, rb"\$4WD,CSB120,PV8\.3,GS000,LF0000,HW00,GM[01]{2}#", 1 / 0.107),
     (6, rb"\$4WD,CSB120,PV8\.3,GS000,LF0000,HW[01]{2},GM00(?=\$)", 24),
 ]
 
