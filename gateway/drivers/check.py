@@ -400,7 +400,8 @@ def check_wheels(family: Family, platform: str) -> Iterator[str]:
     """Check with `wheels_after` of the module, if it has one, what the car does with each frame.
 
     `wheels_after(data)` returns the shares of full speed, -1..1, that the left and the right wheels have after these
-    bytes, or None if the bytes do not change them. It plays the car, so it must not use the driver's own table.
+    bytes, or None if the bytes do not change them. It plays the car, so it must not use the driver's own table. The
+    bytes are a frame, or half a frame with a stop after it, as a car gets them after a failed write.
     """
     wheels_after: Callable[[bytes], tuple[float, float] | None] | None = getattr(family, "wheels_after", None)
     bench = _connected(family, platform, _samples(family))
@@ -418,12 +419,34 @@ def check_wheels(family: Family, platform: str) -> Iterator[str]:
         wheels = wheels_after(driver.stop_frame(index))
         if any(wheels or ()) or (wheels is None and index == driver.STOP_FRAMES - 1):
             yield f"the wheels turn by {wheels} after frame {index} of a stop"
+    yield from _faults_after_half_frames(driver, wheels_after)
     able = [what for what in ACTIONS if not isinstance(what, SetMode) and driver.refusal(what) is None]
     others = [(f"a frame of {what}", frame_of(each)) for what in able for each in driver.frames(what)]
     others += [("a frame of the set-up", data) for _, data, why in bench.sent if why is FrameOrigin.SETUP]
     for name, data in dict.fromkeys(others):
         if any(wheels_after(data) or ()):
             yield f"{name} drives: {data!r}"
+
+
+def _faults_after_half_frames(
+    driver: PlainDriver, wheels_after: Callable[[bytes], tuple[float, float] | None]
+) -> Iterator[str]:
+    """Check that the last frame of a stop, which is also sent alone, stops a car with half a frame in its buffer."""
+    last = driver.stop_frame(driver.STOP_FRAMES - 1)
+    for motion in Motion:
+        frame = driver.motion_frame(motion)
+        for data in (frame[:length] + last for length in range(1, len(frame))):
+            try:
+                wheels = wheels_after(data)
+            except Exception as error:  # noqa: BLE001 - the function of a family may raise anything
+                yield f"wheels_after raises {type(error).__name__} for half a frame with a stop after it: {data!r}"
+                return
+            if wheels is None or any(wheels):
+                yield (
+                    f"the wheels turn by {wheels} after half a frame of {motion} with the last frame of a stop after "
+                    f"it: {data!r}. Begin the stop with bytes that make half a frame invalid"
+                )
+                return
 
 
 def _turns(motion: Motion, left: float, right: float) -> bool:

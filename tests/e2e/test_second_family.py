@@ -85,7 +85,7 @@ class TankServer:
                     if not data:
                         return
                     *lines, rest = (rest + data).split(b"\n")
-                    self.moves += [json.loads(line)["move"] for line in lines if line]
+                    self.moves += [json.loads(line)["move"] for line in lines if line.startswith(b"{")]
                 except TimeoutError:
                     pass
                 peer.sendall(b'{"v":7.9,"dist_cm":42}\n')

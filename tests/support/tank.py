@@ -1,11 +1,13 @@
 """A family of cars from another package: a tank that takes JSON lines over TCP.
 
 A line `{"move":[0.5,0.5]}` sets the share of full power of each side, until the next one. The tank sends
-`{"v":7.9,"dist_cm":42}` five times a second. It has no dead-man, and acknowledges nothing.
+`{"v":7.9,"dist_cm":42}` five times a second. It has no dead-man, acknowledges nothing, and ignores lines that it cannot
+read.
 """
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, ClassVar
 
 from gateway.control.commands import Action
@@ -94,6 +96,11 @@ class TankDriver(PlainDriver):
         sides = [round(self.model.speed * share, 2) for share in SIDES[motion]]
         return json.dumps({"move": sides}).encode() + b"\n"
 
+    def stop_frame(self, index: int) -> bytes:
+        """Return a stop. `#` makes the half line invalid that a failed write may have left in the tank's buffer."""
+        del index
+        return b"#\n" + self.motion_frame(Motion.STOP)
+
     def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
         """Return None: a tank has no lights, no servos."""
         del what
@@ -102,8 +109,12 @@ class TankDriver(PlainDriver):
 
 def wheels_after(data: bytes) -> tuple[float, float] | None:
     """Return what a tank does with these bytes: the shares of full speed of its left and right side. For the check."""
-    sides = json.loads(data).get("move")
-    return None if sides is None else (sides[0], sides[1])
+    wheels = None
+    for line in data.split(b"\n")[:-1]:
+        with suppress(ValueError, KeyError):  # a tank ignores such a line
+            left, right = json.loads(line)["move"]
+            wheels = (left, right)
+    return wheels
 
 
 def profile_of(name: str) -> PlainProfile:

@@ -77,6 +77,14 @@ class Lacks(tank.TankDriver):
         return super().motion_frame(known[motion])
 
 
+class NakedStop(tank.TankDriver):
+    """Sends a stop that half a line spoils."""
+
+    def stop_frame(self, index: int) -> bytes:
+        del index
+        return self.motion_frame(Motion.STOP)
+
+
 class Misnames(tank.TankDriver):
     """Publishes a field that does not exist."""
 
@@ -172,6 +180,10 @@ class Types(tank.TankDriver):
 
     def motion_frame(self, motion: Motion) -> Any:
         return super().motion_frame(motion).decode()
+
+    def stop_frame(self, index: int) -> Any:
+        del index
+        return self.motion_frame(Motion.STOP)
 
 
 class Texts(tank.TankDriver):
@@ -387,6 +399,7 @@ class Doubts(Trusts):
         (OneSpeed, {"check_motions", "check_wheels"}),
         (Turned, {"check_motions", "check_wheels"}),
         (Promises, {"check_capabilities"}),
+        (NakedStop, {"check_wheels"}),
         (Waits, {"check_drive"}),
         (Fails, {"check_bytes", "check_samples", "check_hostile", "check_loss"}),
         (Talks, {"check_connect", "check_stop", "check_end", "check_rest"}),

@@ -35,7 +35,7 @@ class TankBench(Bench):
 
     def moves(self, since: float = 0.0) -> list[list[float]]:
         """Return the motions that were written since then."""
-        return [json.loads(data)["move"] for at, data, _ in self.sent if at >= since]
+        return [json.loads(data.splitlines()[-1])["move"] for at, data, _ in self.sent if at >= since]
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_plain_drive_ends_with_repeated_sent_stop(bench: TankBench) -> None:
     bench.run(2 * RENEWAL_S + 1.0)
     repeats = bench.sent[before:]
     assert [why for _, _, why in repeats] == [FrameOrigin.REPEAT] * 2, "nothing shows that it arrived"
-    assert {data for _, data, _ in repeats} == {b'{"move": [0.0, 0.0]}\n'}
+    assert {data for _, data, _ in repeats} == {b'#\n{"move": [0.0, 0.0]}\n'}
 
 
 @pytest.mark.parametrize("before_s", [0.0, 0.2, 0.4, 0.6])
