@@ -130,6 +130,15 @@ HOSTILE: Final = (
     *(b"null", b'"x"', b"[]", b"{}", b"true", b""),
 )
 """Values that may replace a number in a report of a car, if the report is damaged or from another program."""
+LINE_ENDS: Final = b"\r\n"
+NOT_MEASURED: Final = frozenset({"car", "seq", "boot_id", "level", "no_echo"})
+"""Fields that the gateway fills, or for which false is the right value."""
+LIMITS: Final[Mapping[str, tuple[float, float]]] = {
+    "range_m": (0.0, 12.0),
+    "voltage_v": (0.0, 13.0),
+    **dict.fromkeys(("roll_rad", "pitch_rad", "yaw_rad", "heading_rad"), (-math.pi, math.pi)),
+}
+"""The limits of fields that cars often have in other units (docs/reference/messages.md)."""
 NOISE: Final = b"?\r\nHello\r\n"
 """Bytes that are no report of any car."""
 LOW_SPEED_MAX: Final = 0.3
@@ -473,6 +482,7 @@ def check_samples(family: Family, platform: str) -> Iterator[str]:
         for event in (*driver.feed(sample, 100.0), *driver.flush(110.0)):
             for topic in driver.measured(event):
                 yield f"{topic} is measured in {sample!r}, which is listed in UNMEASURED"
+        driver.drop_bytes()
     profile = family.profile_of(platform)
     measurable = {topic for mode in profile.modes for topic in profile.measurable(mode)}
     for sample in _samples(family):
@@ -480,10 +490,33 @@ def check_samples(family: Family, platform: str) -> Iterator[str]:
         found = [each for event in events for each in driver.measured(event).items()]
         if not found:
             yield f"nothing is measured in {sample!r}, which is listed in SAMPLES"
+        raw = b"".join(event.raw for event in events)
+        if raw.translate(None, LINE_ENDS) != sample.translate(None, LINE_ENDS):
+            yield f"the events of {sample!r} have the bytes {raw!r}: each byte but line ends belongs to one event's raw"
         for topic, fields in found:
             yield from _faults_of_values(topic, fields)
+            yield from _faults_of_sample(topic, fields)
             if topic in TOPICS and topic.removeprefix("sensor/") not in measurable:
                 yield f"{topic} is measured, but the profile does not list it"
+
+
+def _faults_of_sample(topic: str, fields: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the faults of what a real car's bytes give: fields that are missing, and values in another unit."""
+    if topic not in TOPICS:
+        return
+    known = messages.message_class(TOPICS[topic].message).DESCRIPTOR.fields_by_name
+    needed = {name for name, each in known.items() if not each.has_presence and not each.is_repeated}
+    if missing := needed - NOT_MEASURED - fields.keys():
+        yield (
+            f"{topic} has no value for {', '.join(sorted(missing))}, so readers would see 0 or false: give each field "
+            "that is not optional, or leave the topic out"
+        )
+    if topic == "sensor/range" and ("range_m" in fields) == bool(fields.get("no_echo")):
+        yield f"{topic} needs either range_m or no_echo=True"
+    for name in LIMITS.keys() & fields.keys():
+        low, high = LIMITS[name]
+        if not low <= fields[name] <= high:
+            yield f"{topic}: {name} is {fields[name]:g}, not {low:.4g} .. {high:.4g}: is it in another unit?"
 
 
 def check_hostile(family: Family, platform: str) -> Iterator[str]:
@@ -607,12 +640,25 @@ def check_actions(family: Family, platform: str) -> Iterator[str]:
 
 
 def check_capabilities(family: Family, platform: str) -> Iterator[str]:
-    """Check that there are frames for each capability of `PARTS` that the profile lists."""
+    """Check that the profile and the frames agree: each capability of `PARTS`, the lights and the servos."""
     driver = _connected(family, platform).control.driver
+    profile = family.profile_of(platform)
+    if isinstance(driver, PlainDriver) and "mode" in profile.capabilities:
+        yield "it has the capability mode, but a PlainDriver has no modes: no command can open one"
     for word, kind in PARTS.items():
         able = [what for what in ACTIONS if isinstance(what, kind) and driver.refusal(what) is None]
-        if word in driver.model.profile.capabilities and not any(driver.frames(what) for what in able):
+        has_frames = any(driver.frames(what) for what in able)
+        if word in driver.model.profile.capabilities and not has_frames:
             yield f"it has the capability {word}, but no frames for any of its actions"
+        if isinstance(driver, PlainDriver) and has_frames and word not in profile.capabilities:
+            yield f"it has frames for {word}, but not the capability, so no page offers it"
+    if isinstance(driver, PlainDriver):
+        lights = {what.light for what in ACTIONS if isinstance(what, SetLight) and driver.part_frames(what)}
+        servos = {what.action for what in ACTIONS if isinstance(what, MoveServo) and driver.part_frames(what)}
+        for field, words in (("lights", lights), ("servos", servos)):
+            if words != (listed := getattr(profile, field)):
+                odd = ", ".join(sorted(words ^ listed))
+                yield f"{field} of the profile and the frames of part_frames differ in {odd}"
 
 
 def check_loss(family: Family, platform: str) -> Iterator[str]:

@@ -10,13 +10,13 @@ from typing import Any, cast
 import pytest
 from msgspec.structs import replace
 
-from gateway.control.commands import Action, Find
+from gateway.control.commands import Action, AimServo, Find
 from gateway.control.driver import Desk, Event
 from gateway.drivers import Family, check
 from gateway.drivers.plain_profile import PlainProfile
 from gateway.drivers.waveshare import family as waveshare
 from gateway.drivers.yahboom import family as yahboom
-from schemas.words import Basis, Motion
+from schemas.words import Basis, Light, Motion
 from tests.support import tank
 
 FAMILIES = {"yahboom": yahboom, "waveshare": waveshare, "tank": tank}
@@ -83,6 +83,38 @@ class NakedStop(tank.TankDriver):
     def stop_frame(self, index: int) -> bytes:
         del index
         return self.motion_frame(Motion.STOP)
+
+
+class Centimeters(tank.TankDriver):
+    """Publishes a distance in another unit."""
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        return {"sensor/range": {"range_m": 42.0}} if super().measured(event) else {}
+
+
+class NoDistance(tank.TankDriver):
+    """Publishes that there is no distance, but not why."""
+
+    def measured(self, event: Event) -> dict[str, Any]:
+        return {"sensor/range": {}} if super().measured(event) else {}
+
+
+class LosesBytes(tank.TankDriver):
+    """Keeps a part of a line for itself."""
+
+    def feed(self, data: bytes, now: float) -> list[Event]:
+        events = super().feed(data, now)
+        for event in events:
+            if isinstance(event, tank.TankReport):
+                event.raw = event.raw[1:]
+        return events
+
+
+class Aims(tank.TankDriver):
+    """Turns a servo that its profile does not have."""
+
+    def part_frames(self, what: Action) -> tuple[bytes, ...] | None:
+        return (b'{"servo":90}\n',) if isinstance(what, AimServo) else None
 
 
 class Misnames(tank.TankDriver):
@@ -400,6 +432,10 @@ class Doubts(Trusts):
         (Turned, {"check_motions", "check_wheels"}),
         (Promises, {"check_capabilities"}),
         (NakedStop, {"check_wheels"}),
+        (Centimeters, {"check_samples"}),
+        (NoDistance, {"check_samples"}),
+        (LosesBytes, {"check_samples"}),
+        (Aims, {"check_capabilities"}),
         (Waits, {"check_drive"}),
         (Fails, {"check_bytes", "check_samples", "check_hostile", "check_loss"}),
         (Talks, {"check_connect", "check_stop", "check_end", "check_rest"}),
@@ -467,6 +503,14 @@ def test_platform_names_that_no_fleet_file_could_hold(names: tuple[str, ...], fa
         ),
         ({"profile_of": lambda name: replace(tank.profile_of(name), measures=frozenset({"range"}))}, {"check_samples"}),
         (
+            {"profile_of": lambda name: replace(tank.profile_of(name), lights=frozenset({Light.RED}))},
+            {"check_capabilities"},
+        ),
+        (
+            {"profile_of": lambda name: replace(tank.profile_of(name), capabilities=frozenset({"drive", "mode"}))},
+            {"check_capabilities"},
+        ),
+        (
             {"profile_of": lambda name: replace(tank.profile_of(name), capabilities=frozenset({"drives"}))},
             {"check_profile", "check_capabilities"},
         ),
@@ -507,6 +551,27 @@ def test_check_finds_measurement_in_unmeasured_bytes() -> None:
     found = list(check.check_samples(cast("Family", family), "tank"))
     assert len(found) == 1
     assert "sensor/battery" in found[0]
+
+
+def test_check_finds_line_with_three_sensors() -> None:
+    class ThreeSensors(tank.TankDriver):
+        def measured(self, event: Event) -> dict[str, Any]:
+            return {"sensor/line": dict.fromkeys(("left_outer", "left_inner", "right_outer"), True)}
+
+    family = SimpleNamespace(
+        **{
+            **vars(tank),
+            "profile_of": lambda name: replace(tank.PROFILE, measures=frozenset({"line"})),
+            "driver_of": lambda name, kept: ThreeSensors,
+        }
+    )
+    (fault,) = check.check_samples(cast("Family", family), "tank")
+    assert "no value for right_inner" in fault
+
+
+def test_unmeasured_half_frame_does_not_spoil_samples() -> None:
+    family = SimpleNamespace(**vars(tank), UNMEASURED=(b'{"v":7.9,"dist',))
+    assert not list(check.check_samples(cast("Family", family), "tank"))
 
 
 def test_bench_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
