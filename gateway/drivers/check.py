@@ -374,13 +374,15 @@ def check_answers(family: Family, platform: str) -> Iterator[str]:
 
 def check_motions(family: Family, platform: str) -> Iterator[str]:
     """Check that there is a frame for each motion at each speed, and that a stop is not among them."""
+    made = Bench(family, platform).control.driver
+    if isinstance(made, PlainDriver) and not hasattr(made, "STOPS_WITHIN_S"):
+        yield "STOPS_WITHIN_S is missing: the time within which a car stops after it has received its stop"
+        return
     driver = _connected(family, platform).control.driver
     if not isinstance(driver, PlainDriver):
         return  # such a driver has no motion_frame; `check_drive` looks at the frames that it writes
     if driver.STOP_FRAMES < 1:
         yield f"STOP_FRAMES is {driver.STOP_FRAMES}: a stop needs at least one frame"
-    if not hasattr(driver, "STOPS_WITHIN_S"):
-        yield "STOPS_WITHIN_S is missing: the time within which a car stops after it has received its stop"
     stops = {driver.stop_frame(index) for index in range(driver.STOP_FRAMES)} | {driver.motion_frame(Motion.STOP)}
     frames: dict[tuple[float, Motion], bytes] = {}
     for speed, motion in product((SPEED_STEP, 0.5, 1.0), Motion):
@@ -796,12 +798,20 @@ def main(arguments: list[str]) -> int:
             return 2
         if missing:
             sys.stderr.write(
-                f"gateway.drivers.check: {name} has no {', '.join(missing)} (see gateway/drivers/__init__.py)\n"
+                f"gateway.drivers.check: {name} has no {', '.join(missing)} (see docs/how-to/write-a-driver.md)\n"
             )
             return 2
+        told: dict[tuple[str, str], str] = {}
         for platform, what, faults in check(family):
             found += len(faults)
-            sys.stdout.write(f"{platform} {what.removeprefix('check_')}: {'; '.join(faults) or 'ok'}\n")
+            check_name = what.removeprefix("check_")
+            # One mistake may fail every check: write its words once.
+            names = [told.setdefault((platform, fault), check_name) for fault in dict.fromkeys(faults)]
+            words = [
+                fault if name == check_name else f"as in {name}"
+                for fault, name in zip(dict.fromkeys(faults), names, strict=True)
+            ]
+            sys.stdout.write(f"{platform} {check_name}: {'; '.join(words) or 'ok'}\n")
     return 1 if found else 0
 
 

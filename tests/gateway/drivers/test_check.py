@@ -574,6 +574,14 @@ def test_unmeasured_half_frame_does_not_spoil_samples() -> None:
     assert not list(check.check_samples(cast("Family", family), "tank"))
 
 
+def test_one_mistake_is_told_once(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(tank.TankDriver, "STOPS_WITHIN_S")
+    assert check.main(["tests.support.tank"]) == 1
+    told = dict(line.split(": ", 1) for line in capsys.readouterr().out.splitlines())
+    assert told["tank motions"].startswith("STOPS_WITHIN_S is missing")
+    assert told["tank connect"] == "as in bytes"
+
+
 def test_bench_of_the_page_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     page = (Path(__file__).parents[3] / "docs/how-to/write-a-driver.md").read_text()
     (block,) = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "Bench(" in each]
