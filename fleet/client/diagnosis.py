@@ -20,6 +20,7 @@ from schemas.keys import name_of
 from schemas.local_time import clock
 from schemas.rights import binding_pause
 from schemas.words import (
+    UNKNOWN,
     Basis,
     BatteryLevel,
     CarTrust,
@@ -395,13 +396,14 @@ def describe(evidence: CarEvidence) -> Iterator[tuple[str, str]]:
             f"{claims.link.short} for {link.since_s:.0f} s, {counts}{f'; rejected: {rejected}' if rejected else ''}",
         )
     if mode is not None:
-        inferred = "" if mode.inferred == mode.asked else f", probably {mode.inferred}"
+        is_other = mode.inferred not in ("", mode.asked, UNKNOWN)
+        inferred = f", probably {mode.inferred}" if is_other else ""
         yield "mode", f"{claims.mode.short}{inferred}{f': {mode.evidence}' if mode.evidence else ''}"
     if safety is not None:
         yield "motors", f"{claims.motors.words}; trust {safety.trust}"
         yield "control", _control(state.car, safety)
     if health is not None:
-        seen = "; ".join(health.platform_evidence) or "nothing was seen yet"
+        seen = "; ".join(health.platform_evidence) or "no bytes of the car have shown it"
         volts = f", battery {battery.voltage_v:.2f} V ({battery.level})" if battery is not None else ""
         yield "platform", f"{health.platform}{volts}: {seen}"
         yield "reports", describe_reports(health)

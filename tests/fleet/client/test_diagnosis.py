@@ -201,6 +201,13 @@ def test_facts_have_counts_evidence_and_last_refusal() -> None:
     assert facts["refused"].endswith(" [held] (1 more before)")
 
 
+def test_facts_of_a_car_that_shows_neither_mode_nor_platform() -> None:
+    mode = pb.Mode(asked="manual", inferred="unknown", verdict="assumed", evidence="this car has one mode")
+    facts = dict(describe(with_states(mode=mode, health=pb.Health(platform="tank"))))
+    assert facts["mode"] == "manual (assumed): this car has one mode"
+    assert "nothing was seen" not in facts["platform"], "its readings may arrive, but do not show the platform"
+
+
 @pytest.mark.parametrize(("platform", "advised"), [("arduino", True), ("", True), ("ugv_rover", False)])
 def test_silent_car_of_another_family_is_not_advised_as_the_first(platform: str, advised: bool) -> None:
     found = diagnose(with_states(link=STALE, health=pb.Health(platform=platform)))
