@@ -288,7 +288,7 @@ class CarGateway:
     def _log_link_open(self) -> None:
         """Log that the link is open. If saved knowledge about the car is not used, log why."""
         if self._learned_file.trouble:
-            self._commands.log(Level.INFO, "learns_again", f"{self._settings.car}: {self._learned_file.trouble}")
+            self._commands.log(Level.INFO, "learns_again", self._learned_file.trouble)
             self._learned_file.trouble = ""
         self._commands.log(Level.INFO, "link_open", f"{self._link.url} is open. The gateway stops the car first.")
 

@@ -423,7 +423,7 @@ class Controller(Generic[D_co]):
             return
         by, of = sender.told_beside(before.holder), before.holder.told_beside(sender)
         words = f"taken over by {by} ({sender.kind}) from {of} ({before.holder.kind})"
-        self._log.log(Level.INFO, "lease_taken", f"{self.car}: {words}", now)
+        self._log.log(Level.INFO, "lease_taken", words, now)
         if (
             self._queue.held is not None
             and self._queue.held.sender != sender

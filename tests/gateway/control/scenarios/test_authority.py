@@ -189,7 +189,7 @@ def test_person_outranks_script_and_loser_learns_by_whom(desk: Workbench) -> Non
     assert desk.end("d") == (SUPERSEDED, Reason.SUPERSEDED)
     assert next(record.words for record in desk.records if record.phase is SUPERSEDED) == "left by mia"
     assert desk.logs[-1].code == "lease_taken"
-    assert "by mia (person) from script (script)" in desk.logs[-1].words
+    assert desk.logs[-1].words == "taken over by mia (person) from script (script)", "who prints it names the car"
     assert "mia (person)" in desk.ask(FORWARD, SCRIPT).words
 
 
