@@ -131,8 +131,8 @@ def servo(
 ) -> None:
     """Move a servo: left, right or reset (vertical: up, down or reset). The front servo also accepts 0 to 180 degrees.
 
-    SERVO is front, horizontal or vertical. The car turns the front servo to 180 minus the number, and a car with the
-    platform option +ptz_direct to the number.
+    SERVO is front, horizontal or vertical. An arduino, stm32 or raspberry_pi car turns the front servo to 180 minus the
+    number, and with the platform option +ptz_direct to the number.
     """
     carry_out(client, request, cars, take=take, as_json=as_json)
 

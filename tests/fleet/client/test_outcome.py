@@ -191,7 +191,7 @@ def test_lost_gateway_is_reported_after_grace_second() -> None:
         ("mode", "tracking", ("sent", "", "", ""), "switching to mode tracking"),
         ("led", "", ("sent", "", "", ""), "LED color sent"),
         ("light", "cyan", ("sent", "", "", ""), "light cyan sent"),
-        ("servo", "", ("sent", "", "", ""), "servo angle sent"),
+        ("servo", "", ("sent", "", "", ""), "servo movement sent"),
         ("arm", "", ("sent", "", "", ""), "arm joints sent"),
         ("whistle", "", ("sent", "", "", ""), "whistle sent"),
         ("speed", "up", ("sent", "", "", ""), "speed step up sent"),
