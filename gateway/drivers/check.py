@@ -133,12 +133,6 @@ HOSTILE: Final = (
 LINE_ENDS: Final = b"\r\n"
 NOT_MEASURED: Final = frozenset({"car", "seq", "boot_id", "level", "no_echo"})
 """Fields that the gateway fills, or for which false is the right value."""
-LIMITS: Final[Mapping[str, tuple[float, float]]] = {
-    "range_m": (0.0, 12.0),
-    "voltage_v": (0.0, 13.0),
-    **dict.fromkeys(("roll_rad", "pitch_rad", "yaw_rad", "heading_rad"), (-math.pi, math.pi)),
-}
-"""The limits of fields that cars often have in other units (docs/reference/messages.md)."""
 NOISE: Final = b"?\r\nHello\r\n"
 """Bytes that are no report of any car."""
 LOW_SPEED_MAX: Final = 0.3
@@ -515,9 +509,8 @@ def _faults_of_sample(topic: str, fields: Mapping[str, Any]) -> Iterator[str]:
         )
     if topic == "sensor/range" and ("range_m" in fields) == bool(fields.get("no_echo")):
         yield f"{topic} needs either range_m or no_echo=True"
-    for name in LIMITS.keys() & fields.keys():
-        low, high = LIMITS[name]
-        if not low <= fields[name] <= high:
+    for name, (low, high) in TOPICS[topic].ranges.items():
+        if name in fields and not low <= fields[name] <= high:
             yield f"{topic}: {name} is {fields[name]:g}, not {low:.4g} .. {high:.4g}: is it in another unit?"
 
 
