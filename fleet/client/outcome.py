@@ -93,7 +93,8 @@ class Outcome:
             text += f"; motors off within {at_most_s:.1f} s if the frames arrived"
         if self.next_step:
             text += f". {self.next_step}"
-        return with_code(f"{self.car}: {text}", self.code)
+        named = text if text.startswith(f"{self.car} ") else f"{self.car}: {text}"
+        return with_code(named, self.code)
 
 
 class NotCarriedOut(Exception):

@@ -114,6 +114,7 @@ def test_no_answer_says_whether_there_is_a_gateway(alive: bool, words: str) -> N
     assert progress.outcome.phase == "no_answer"
     assert progress.outcome.words.startswith(words)
     assert "after 10 s" in progress.outcome.words
+    assert str(progress.outcome).startswith("red may" if words.startswith("red") else f"red: {words}")
 
 
 def test_query_timeout_is_ignored_while_records_come() -> None:
