@@ -153,7 +153,7 @@ class CarGateway:
             self._publisher,
             self._wake,
             on_gap=self._on_gap,
-            on_opened_as_changed=partial(self._save_learned, at_once=True),
+            on_urgent_change=partial(self._save_learned, at_once=True),
             notifier=self._notifier,
         )
         self._hub_lost = asyncio.Event()

@@ -24,14 +24,14 @@ class Writer:
         wake: WriterWakeup,
         *,
         on_gap: Callable[[float], None],
-        on_opened_as_changed: Callable[[float], None],
+        on_urgent_change: Callable[[float], None],
         notifier: ServiceNotifier,
     ) -> None:
         """Make the writer of a car. `on_gap` is called before a frame is chosen, to detect a gap of the loop.
 
-        `on_opened_as_changed` is called when `Driver.opened_as` has changed. `notifier` tells systemd after each turn
-        and each frame that the gateway works, and at no other time. So if no frame can be written any more, systemd
-        starts another gateway, which stops the car.
+        `on_urgent_change` is called when `Driver.opened_as` or the speed of the car has changed. `notifier` tells
+        systemd after each turn and each frame that the gateway works, and at no other time. So if no frame can be
+        written any more, systemd starts another gateway, which stops the car.
         """
         self._loop = asyncio.get_running_loop()
         self._driver = driver
@@ -39,7 +39,7 @@ class Writer:
         self._publisher = publisher
         self._wake = wake
         self._on_gap = on_gap
-        self._on_opened_as_changed = on_opened_as_changed
+        self._on_urgent_change = on_urgent_change
         self._notifier = notifier
         self.finished = asyncio.Event()
         """Set when the driver has finished after `shut_down`."""
@@ -74,10 +74,11 @@ class Writer:
                 await link.close()  # `keep_open` wakes and reopens it
                 return
             now = self._loop.time()
-            opened_as = self._driver.opened_as
+            before = self._driver.opened_as, self._driver.model.outputs.speed
             self._driver.on_written(write, now)
-            if self._driver.opened_as != opened_as:  # the next gateway needs this to stop the car
-                self._on_opened_as_changed(now)
+            # The next gateway needs this to stop the car, and not to exceed `speed_max`.
+            if (self._driver.opened_as, self._driver.model.outputs.speed) != before:
+                self._on_urgent_change(now)
             self._link.health.on_written(len(write.data), now)
             self._publisher.publish_frame(write, now, whole=True)
             self._notifier.feed(now)

@@ -138,7 +138,11 @@ class LimitsEntry(Entry):
         default=DEFAULT_MAX_DRIVE_S, gt=0, le=3600, description="longest duration of one drive command, seconds"
     )
     speed_max: float = Field(
-        default=1.0, gt=0, le=1, description="highest speed of drives, as a share of the car's top speed"
+        default=1.0,
+        gt=0,
+        le=1,
+        description="highest speed of drives, as a share of the car's top speed; in a mode, a car drives at the speed "
+        "of its own program",
     )
     battery_low_v: _Volts = Field(
         default=LOW_V,

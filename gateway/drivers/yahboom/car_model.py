@@ -67,7 +67,7 @@ class CarModel:
         self.evidence = StopEvidence(self.profile, self.learned)
         self.battery = Battery(self.battery_policy.of_cells(self.profile.cells), self.profile.cells)
         self.pacing = Pacing(self.profile, self.learned)
-        self.believed = StateEstimate(self.profile)
+        self.believed = StateEstimate(self.profile, speeds=self.learned.speeds)
 
     def treat_as(self, profile: Profile) -> None:
         """Use the profile of another platform from now on."""

@@ -251,6 +251,7 @@ class CarMonitor:
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self._executor.senders.halt_streams(now)
         self.model.learn(TrustEvent.HEARD, now, words)
+        self.model.believed.allow_restart()
         self._stops.on_contact(now, words)
 
     def _log_contradiction(self, before: Verdict, now: float) -> None:

@@ -28,6 +28,7 @@ from gateway.control.driver import Desk, Event, Fields
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.car_monitor import CarMonitor
 from gateway.drivers.yahboom.estimate.learned import Learned
+from gateway.drivers.yahboom.estimate.outputs import kept_speeds, stepped
 from gateway.drivers.yahboom.executor import Executor
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
@@ -167,8 +168,11 @@ class YahboomDriver(Executor):
 
     def _too_fast(self, step: SpeedStep) -> str | None:
         """Return why this step would make the car too fast, or None if it would not."""
-        speed, before = self.model.profile.speed, self.model.believed.speed
-        after = speed.step(before, step)
+        speed, speeds = self.model.profile.speed, self.model.believed.speeds[self.model.profile.kind]
+        for each in self.queue.one_shots:
+            if isinstance(each.command.what, ChangeSpeed):  # it waits, and may be written before this one, or expire
+                speeds = speeds | stepped(speed, speeds, each.command.what.step)
+        before, after = max(speeds), max(stepped(speed, speeds, step))
         share, maximum = speed.fraction(after), self.desk.speed_max
         if after <= before or share <= maximum:
             return None
@@ -185,7 +189,8 @@ class YahboomDriver(Executor):
         advice = f"`fleet speed {car} down` lowers it." if slowest <= maximum else f"Its slowest is {slowest:.0%}."
         drives = f"drives at about {share:.0%} of full speed"
         if believed.speed_is_bound:
-            drives = f"may drive at up to {share:.0%} of full speed, because a mode has set its speed"
+            cause = "because a mode or a restart of the car may have changed its speed"
+            drives = f"may drive at up to {share:.0%} of full speed, {cause}"
         return f"{car} {drives}. Its maximum is {maximum:.0%} (speed_max). {advice}"
 
     def frames(self, what: Action) -> tuple[Frame | Later, ...]:
@@ -241,7 +246,7 @@ class YahboomDriver(Executor):
 
     def kept(self) -> Mapping[str, Any]:
         """Return what was learned about the car."""
-        return self.model.learned.kept()
+        return {**self.model.learned.kept(), "speeds": kept_speeds(self.model.believed.speeds)}
 
     @property
     def opened_as(self) -> str:

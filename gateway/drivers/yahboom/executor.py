@@ -64,6 +64,7 @@ class Executor(Driver):
         model.link_open = True
         model.missed_stop = False
         model.link_since = now
+        model.believed.allow_restart()
         model.evidence.begin_link()
         model.pacing.reset()
         self.senders.halt_streams(now)

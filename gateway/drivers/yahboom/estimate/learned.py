@@ -23,6 +23,7 @@ from typing import Any, Final
 
 from msgspec import Struct, field
 
+from gateway.drivers.yahboom.estimate.outputs import Speeds, restored_speeds, speeds_at_start
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, Ptz
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.sensors import SENSOR_FIELDS, RejectedField, Sensors
@@ -156,6 +157,8 @@ class Learned(Struct):
     """The platform that was detected when the gateway last opened a mode, until a report shows mode 0 again. In a
     silent mode, only this tells the next gateway how to end the mode. Empty if no mode is open, or if the platform is
     configured."""
+    speeds: Speeds = field(default_factory=speeds_at_start)
+    """The speeds that the car may have had when the last gateway ended."""
     reporting: set[Mode] = field(default_factory=set)
     """The modes in which the car has sent readings."""
     extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -302,6 +305,7 @@ class Learned(Struct):
             if not all(0.0 < each <= MAX_LEARNED_S for each in intervals):  # also refuses NaN
                 raise ValueError(f"{name}: {intervals}")
             rhythm.restore(intervals)
+        learned.speeds = restored_speeds(kept.get("speeds", {}))
         learned._blocks = {Blocking(kind): float(block_s) for kind, block_s in kept["blocks_s"].items()}
         if not all(0.0 < each <= MAX_LEARNED_S for each in learned._blocks.values()):
             raise ValueError(f"blocks_s: {learned._blocks}")

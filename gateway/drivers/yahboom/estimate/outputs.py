@@ -1,15 +1,29 @@
 """Estimates motion, speed, fan, servo and LED of the car from the written frames.
 
 The car confirms none of them. Its readings are evidence only of its mode (see mode.py).
+
+*Speed.* A car has a speed from its start, and keeps it while the gateway or the link is gone, unless it is switched off
+meanwhile. So the estimate is a set of speeds that the car may have, one set for each kind of program, because the
+platform may be detected again. `speed_max` is compared with the highest of them. A step changes each of them, and
+several may become one again.
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from msgspec.structs import replace
 
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen, Ptz
-from gateway.drivers.yahboom.protocol.platforms import Profile
-from schemas.words import Motion, SpeedStep
+from gateway.drivers.yahboom.protocol.platforms import SPEEDS, Profile, SpeedModel
+from schemas.words import Mode, Motion, Platform, SpeedStep
+
+Speeds = dict[Platform, frozenset[float]]
+"""For each platform, the speeds that a car with such a program may have, in its own unit."""
+
+
+def speeds_at_start() -> Speeds:
+    """Return the speeds of a car that was just switched on."""
+    return {kind: frozenset({model.start}) for kind, model in SPEEDS.items()}
 
 
 @dataclass(slots=True)
@@ -29,13 +43,21 @@ class StateEstimate:
     """True if the fan was toggled, and no reading has arrived since it reached its new state."""
     servo_deg: int | None = None
     led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
-    speed: float = field(init=False)
-    """In the unit of the car (see `SpeedModel`)."""
-    speed_is_bound: bool = False
-    """True if the car may be slower than `speed`, because a mode has set its speed."""
+    speeds: Speeds = field(default_factory=speeds_at_start)
 
-    def __post_init__(self) -> None:
-        self.speed = self.profile.speed.start
+    @property
+    def speed(self) -> float:
+        """Return the highest speed that the car may have, in its own unit (see `SpeedModel`)."""
+        return max(self.speeds[self.profile.kind])
+
+    @property
+    def speed_is_bound(self) -> bool:
+        """Return True if the car may be slower than `speed`."""
+        return len(self.speeds[self.profile.kind]) > 1
+
+    def allow_restart(self) -> None:
+        """Allow for a car that was switched off and on, and has the speed of its start now."""
+        self.speeds = {kind: speeds | {SPEEDS[kind].start} for kind, speeds in self.speeds.items()}
 
     def on_written(self, frame: Frame, now: float) -> None:
         """Apply a written frame."""
@@ -45,7 +67,7 @@ class StateEstimate:
                     self.repeat = self.repeat or frame.motion is not self.motion
                 self.motion = frame.motion
                 if frame.speed is not None:
-                    self._step(frame.speed)
+                    self.speeds = {kind: stepped(SPEEDS[kind], at, frame.speed) for kind, at in self.speeds.items()}
                 if self.profile.fan_is_level:
                     self.fan_at = now if frame.fan is not self.fan else self.fan_at
                     self.fan = frame.fan
@@ -55,8 +77,8 @@ class StateEstimate:
                     self.fan_toggled = True
             case ModeClose():
                 self.motion = Motion.STOP
-            case ModeOpen(mode) if mode in self.profile.speed.set_by:
-                self.speed, self.speed_is_bound = self.profile.speed.top, True
+            case ModeOpen(mode):
+                self.speeds = {kind: _after_mode(SPEEDS[kind], at, mode) for kind, at in self.speeds.items()}
             case Ptz(deg):
                 self.servo_deg = deg
             case ColorLed():
@@ -64,16 +86,14 @@ class StateEstimate:
             case _:
                 pass
 
-    def _step(self, step: SpeedStep) -> None:
-        self.speed = max(self.profile.speed.step(self.speed, step), self.slowest if self.speed_is_bound else 0.0)
-
     @property
     def slowest(self) -> float:
-        """Return the lowest value that steps down give `speed`.
-
-        If the speed is not known, a step down may have led to `rebound`, and the next one below it, and so on.
-        """
-        return self.profile.speed.rebound if self.speed_is_bound else self.profile.speed.low
+        """Return the lowest value that steps down give `speed`."""
+        model, speeds = self.profile.speed, self.speeds[self.profile.kind]
+        seen = {speeds}
+        while (speeds := stepped(model, speeds, SpeedStep.DOWN)) not in seen:
+            seen.add(speeds)
+        return min(map(max, seen))
 
     @property
     def fan_may_run(self) -> bool:
@@ -89,3 +109,29 @@ class StateEstimate:
         if not isinstance(frame, General) or not self.profile.fan_is_level:
             return frame
         return replace(frame, fan=bool(self.fan))
+
+
+def stepped(model: SpeedModel, speeds: Iterable[float], step: SpeedStep) -> frozenset[float]:
+    """Return the speeds that one step gives a car which has one of these speeds."""
+    return frozenset(model.step(speed, step) for speed in speeds)
+
+
+def _after_mode(model: SpeedModel, speeds: frozenset[float], mode: Mode) -> frozenset[float]:
+    """Return the speeds that a car may have after this mode: any speed, if the mode sets it."""
+    return frozenset(map(float, range(int(model.top) + 1))) if mode in model.set_by else speeds
+
+
+def kept_speeds(speeds: Speeds) -> dict[str, list[float]]:
+    """Return the speeds as JSON values, without those of a car that was just switched on."""
+    return {str(kind): sorted(each) for kind, each in speeds.items() if each != {SPEEDS[kind].start}}
+
+
+def restored_speeds(kept: Mapping[str, Iterable[float]]) -> Speeds:
+    """Return the speeds from the result of `kept_speeds`. Raises ValueError or TypeError if that is damaged."""
+    speeds = speeds_at_start()
+    for kind, each in kept.items():
+        values, model = frozenset(map(float, each)), SPEEDS[Platform(kind)]
+        if not values or not all(0.0 <= value <= model.top for value in values):  # also refuses NaN
+            raise ValueError(f"speeds of {kind}: {values}")
+        speeds[Platform(kind)] = values
+    return speeds

@@ -95,6 +95,12 @@ STM32_SPEED: Final = SpeedModel(start=200, increment=100, low=100, rebound=100, 
 # platforms: speed. Raspberry Pi +-20 in 20..100 %. The start is 80 % in one program and 50 % in another. The faster one
 # is assumed, so that no car exceeds `speed_max`
 RASPBERRY_PI_SPEED: Final = SpeedModel(start=80, increment=20, low=20, rebound=20, top=100, set_by=frozenset())
+SPEEDS: Final[Mapping[Platform, SpeedModel]] = {
+    Platform.ARDUINO: ARDUINO_SPEED,
+    Platform.STM32: STM32_SPEED,
+    Platform.RASPBERRY_PI: RASPBERRY_PI_SPEED,
+    Platform.UNKNOWN: ARDUINO_SPEED,
+}
 
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters
 _PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0
@@ -451,7 +457,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _ALL_LIGHTS,
                 _FRONT,
                 StopStyle.MODE_FRAME,
-                ARDUINO_SPEED,
+                SPEEDS[kind],
             )
         case Platform.STM32:
             return Profile(
@@ -462,7 +468,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _STM32_LIGHTS,
                 _FRONT,
                 StopStyle.TIMER,
-                STM32_SPEED,
+                SPEEDS[kind],
                 not_observed=("the slowest speed", "readings while the fan runs"),
             )
         case Platform.RASPBERRY_PI:
@@ -474,7 +480,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _LIGHTS_2_TO_4,
                 _FRONT | _VERTICAL | _HORIZONTAL,
                 StopStyle.GENERAL,
-                RASPBERRY_PI_SPEED,
+                SPEEDS[kind],
                 constants=_CONSTANTS,
                 not_observed=("the speed at the start",),
             )
@@ -487,7 +493,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _LIGHTS_2_TO_4,
                 _FRONT,
                 StopStyle.GENERAL,
-                ARDUINO_SPEED,
+                SPEEDS[kind],
                 constants=_CONSTANTS,
                 not_observed=("only what every known platform has is used",),
             )

@@ -25,7 +25,7 @@ def test_no_step_beyond_the_speed_that_is_allowed(
     platform: str, speed: float, step: SpeedStep, limit: float, refused: bool
 ) -> None:
     driver = control(parse_platform(platform), speed_max=limit).driver
-    driver.model.believed.speed = speed
+    driver.model.believed.speeds[driver.model.profile.kind] = frozenset({speed})
     words = driver.refusal(ChangeSpeed(step))
     assert (words is not None) is refused
     assert words is None or f"{limit:.0%}" in words
@@ -42,7 +42,7 @@ def test_no_drive_beyond_the_speed_that_is_allowed(platform: str, limit: float, 
         assert words is not None
         assert f"{limit:.0%}" in words
         assert driver.refusal(ChangeSpeed(SpeedStep.DOWN)) is None
-        driver.model.believed.speed = driver.model.profile.speed.step(driver.model.believed.speed, SpeedStep.DOWN)
+        driver.model.believed.on_written(General(Motion.STOP, speed=SpeedStep.DOWN), 0.0)
     assert driver.refusal(Drive(Motion.FORWARD)) is None
 
 
