@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Final
 
@@ -203,7 +204,7 @@ def _car(spec: FleetCar) -> CarProcessSpec:
         spec.link,
         spec.platform,
         (
-            *("--longest-drive", f"{limits.longest_drive_s:g}"),
+            *("--longest-drive", _seconds(limits.longest_drive_s)),
             *("--speed-max", f"{limits.speed_max:g}"),
             *("--on-battery-low", limits.on_battery_low, "--battery-low-v", f"{limits.battery_low_v:g}"),
             *(
@@ -214,6 +215,11 @@ def _car(spec: FleetCar) -> CarProcessSpec:
             ),
         ),
     )
+
+
+def _seconds(value: float) -> str:
+    """Return a number of seconds as an option takes it: with all its digits, and without an exponent."""
+    return format(Decimal(repr(value)).normalize(), "f")
 
 
 def _people(car: str, people: Mapping[str, FleetPerson]) -> tuple[str, ...]:

@@ -50,6 +50,8 @@ COLOR_MAX: Final = 255
 DEG_MAX: Final = 180
 ARM_JOINTS: Final = 6
 """Maximum of a color, maximum of an angle in degrees, number of joints (docs/reference/keys.md#command-keys)."""
+DEFAULT_DRIVE_S: Final = 0.5
+"""Duration of a drive that names none, unless the car may only be driven for less."""
 MAX_NAME_LENGTH: Final = 128
 """Maximum characters of a sender's name or an id."""
 _SAME_QUERY_NS: Final = 2_000_000_000
@@ -249,7 +251,7 @@ def _seconds(field: str, value: float, top: float, bottom: float = 0.0) -> float
 
 
 def _drive(message: Any, longest_s: float, car: str) -> Action:
-    duration_s = 0.5
+    duration_s = min(DEFAULT_DRIVE_S, longest_s)
     if message.HasField("duration_s"):
         if longest_s < message.duration_s < math.inf:
             limit = f"at most {longest_s:g} s (longest_drive_s in its fleet file)"

@@ -23,6 +23,7 @@ from fleet.supervisor.spec import (
     recorder_command,
     simulator_command,
 )
+from schemas.duration import parse_duration
 from schemas.rights import NO_PEOPLE, People
 from schemas.yaml_document.document import BadFile
 from tests.support.driver_package import installed_driver
@@ -66,6 +67,14 @@ def test_cars_of_another_package_are_not_simulated(tmp_path: Path, monkeypatch: 
             assert has_parts(warning, "max … cannot be simulated … tank")
         with pytest.raises(ValueError, match=r"max .* cannot be simulated"):
             build_spec(file, UpOptions(simulated=1))
+
+
+@pytest.mark.parametrize("longest_drive_s", ["3", "3600", "0.25", "0.000001", "1234.5678"])
+def test_gateway_takes_any_duration_of_a_file(longest_drive_s: str, tmp_path: Path) -> None:
+    text = FILE.replace("longest_drive_s: 3}", f"longest_drive_s: {longest_drive_s}}}")
+    words = build_spec(parse_fleet(text, tmp_path / "fleet.yaml"), UpOptions()).cars["ann"].arguments
+    given = words[words.index("--longest-drive") + 1]
+    assert parse_duration(given, max_s=3600) == float(longest_drive_s)
 
 
 @pytest.mark.parametrize(("quota", "size"), [("20GB", 20e9), ("1 MB", 1e6), ("999999GB", 999_999e9), ("999TB", 999e12)])

@@ -114,6 +114,14 @@ def test_payload_is_parsed_to_command(verb: str, payload: Any, what: Action) -> 
             assert ask(verb, message.SerializeToString(), encoding).what == what
 
 
+@pytest.mark.parametrize(("longest_drive_s", "lasts_s"), [(10.0, 0.5), (0.5, 0.5), (0.3, 0.3), (1e-06, 1e-06)])
+def test_drive_without_duration_is_no_longer_than_allowed(longest_drive_s: float, lasts_s: float) -> None:
+    for payload in ({"motion": "forward"}, {"motion": "forward", "continues": True}):
+        what = ask("drive", payload, longest_drive_s=longest_drive_s).what
+        assert isinstance(what, Drive)
+        assert what.duration_s == lasts_s
+
+
 def test_parser_knows_every_verb_once() -> None:
     for verb in COMMANDS:
         assert (verb, parsed(Request(verb, b"{}", messages.JSON))[0].verb) == (verb, verb)
