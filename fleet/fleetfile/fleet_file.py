@@ -34,11 +34,13 @@ from schemas.limits import DEFAULT_MAX_DRIVE_S
 from schemas.links import BadLink
 from schemas.platform_name import AUTO, normalize_name
 from schemas.rights import NO_PEOPLE, People, PersonRole
-from schemas.words import BatteryAction, Platform
+from schemas.words import BatteryAction, Mode, Platform
 from schemas.yaml_document.document import BadFile, Document, read_text
 from schemas.yaml_document.fault_words import Where, quote_value, suggest
 
 PATHS: Final = ("plan", "world")
+_MODES_TO_OPEN: Final = frozenset(Mode) - {Mode.MANUAL}
+_MODES_THAT_DRIVE: Final = _MODES_TO_OPEN - {Mode.COLOR_LED}
 
 
 class Limits(Struct, frozen=True):
@@ -227,9 +229,18 @@ def _resolve_people(file: FileEntry) -> Mapping[str, FleetPerson]:
 
 
 def _is_without(word: str, car: Mapping[str, Any]) -> bool:
-    """Return True if the car is without this mode or part. `servo` stands for all servos."""
+    """Return True if the car is without this mode or part.
+
+    `servo` stands for all servos, `drive` also for the modes in which the car drives by itself or by its remote, and
+    `mode` for all modes but manual.
+    """
     without = car.get("without", ())
-    return word in without or ("servo" in without and word.startswith("servo_"))
+    return (
+        word in without
+        or ("servo" in without and word.startswith("servo_"))
+        or ("drive" in without and word in _MODES_THAT_DRIVE)
+        or ("mode" in without and word in _MODES_TO_OPEN)
+    )
 
 
 def default_color(name: str, index: int) -> str:

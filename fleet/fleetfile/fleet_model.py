@@ -179,7 +179,8 @@ class CommonEntry(Entry):
     )
     without: list[Capability] = Field(
         default_factory=list,
-        description="modes and parts of the car that are broken or absent, so that the plan does not use them",
+        description="modes and parts of the car that are broken or absent, so that the plan does not use them. servo: "
+        "all servos; drive: also the modes in which the car drives; mode: all modes but manual",
     )
     limits: LimitsEntry = Field(default_factory=LimitsEntry, description="limits of speed, time and battery")
     roles: list[_Name] = Field(

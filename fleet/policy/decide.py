@@ -438,4 +438,5 @@ def _command_blinks(
 
 
 def _obeys_led(known: CarSnapshot) -> bool:
-    return known.mode == Mode.MANUAL and known.verdict != Verdict.CONTRADICTED and not known.busy
+    is_in_manual = known.mode == Mode.MANUAL and known.verdict != Verdict.CONTRADICTED
+    return is_in_manual and not known.busy and not known.lacks_led

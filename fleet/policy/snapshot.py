@@ -17,6 +17,7 @@ from fleet.conditions.functions import FUNCTIONS, ConditionFunction, split_call
 from gateway import drivers
 from schemas import messages, topics
 from schemas.car_profile import CarProfile
+from schemas.commands import Verb
 from schemas.messages import Observation
 from schemas.words import Motors
 
@@ -157,6 +158,13 @@ class CarSnapshot(Struct, frozen=True):
         """Return True if the car's platform does not know this mode, or the fleet file forbids it."""
         profile = self.profile
         return (profile is not None and mode not in profile.modes) or (self.listed and mode not in self.capabilities)
+
+    @property
+    def lacks_led(self) -> bool:
+        """Return True if the car's platform has no color LED, or the fleet file says that the car is without it."""
+        profile = self.profile
+        has_none = profile is not None and Verb.LED not in profile.capabilities
+        return has_none or (self.listed and Verb.LED not in self.capabilities)
 
 
 @cache

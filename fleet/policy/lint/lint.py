@@ -257,6 +257,9 @@ class _Check:
             whys = {car: self._reach.explain_barrier(car, role) for car in cars}
             if certain and cars and all(whys.values()):
                 yield PlanFault(Severity.ERROR, rule.name, f"{who} can never have role {role.name}: {whys[who]}")
+        if effect.led is not None and cars and all(self._reach.cars[car].lacks_led for car in cars):
+            words = f"{who} has no color LED" if certain else "no car has a color LED"
+            yield PlanFault(Severity.WARNING, rule.name, f"its color is never seen: {words}")
         mode = effect.mode
         if mode is None or not cars or not all(self._cannot(car, mode) for car in cars):
             return

@@ -18,7 +18,7 @@ from gateway.control import battery
 from gateway.link import BadUrl, parse_url
 from schemas.colors import car_color, hex_color
 from schemas.links import BadLink, parse_link
-from schemas.words import BatteryAction
+from schemas.words import BatteryAction, Mode
 from schemas.yaml_document.document import BadFile, schema_of
 from tests.support.text_parts import has_parts
 
@@ -269,6 +269,20 @@ def test_large_fleet_file_takes_linear_time(link: str) -> None:
     began = time.process_time()
     assert len(_fleet(f"cars:\n{lines}").cars) == 4000
     assert time.process_time() - began < 4.0, "a comparison of each pair takes 9 to 60 s"
+
+
+@pytest.mark.parametrize(
+    ("without", "modes"),
+    [
+        ("[drive]", {"manual", "color_led"}),
+        ("[mode]", {"manual"}),
+        ("[tracking, following]", set(Mode) - {"tracking", "following"}),
+        ("[led]", set(Mode)),
+    ],
+)
+def test_car_without_drive_or_mode_is_without_its_modes(without: str, modes: set[str]) -> None:
+    car = _fleet(f"cars: {{red: {{link: COM1, platform: arduino, without: {without}}}}}").cars["red"]
+    assert {mode for mode in Mode if mode in car.capabilities} == modes
 
 
 def test_car_without_link_is_allowed_for_finders() -> None:

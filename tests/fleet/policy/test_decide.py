@@ -342,6 +342,21 @@ rules: [{when: {car: green, is: light.left}, then: {who: red, mode: manual, led:
     assert coloured == [2.1], "nor by a coordinator that takes over"
 
 
+@pytest.mark.parametrize("led", ["red", "{color: red}"])
+def test_led_that_a_car_lacks_is_not_used(led: str) -> None:
+    """A car got its color although the fleet file says that its LED is broken, and an stm32 car refused it for ever."""
+    rules = f"rules: [{{when: light.left, then: {{who: all_cars, led: {led}}}}}]"
+    run = PolicyRun(parse(f"roles: {{rest: {{mode: manual, count: all}}}}\n{rules}"), "blue", "green", "red", "white")
+    run.change("green", platform="stm32")
+    run.change("red", listed=True, capabilities=frozenset({"drive", "manual"}))
+    run.change("white", listed=True, capabilities=frozenset({"drive", "manual", "led"}))
+    run.sees("blue", light={"left": True})
+    told = set[str]()
+    for tenths in range(30):
+        told |= {ask.car for ask in run.at(tenths / 10).commands if ask.led is not None}
+    assert told == {"blue", "white"}
+
+
 def test_led_blinks_while_rule_is_in_force() -> None:
     plan = parse("""
 fixed: {red: {mode: manual}}

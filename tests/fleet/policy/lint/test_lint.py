@@ -1,6 +1,7 @@
 """`fleet check` finds parts of a plan that can never work, and accepts all others."""
 
 import pytest
+from msgspec.structs import replace
 
 from fleet.policy.lint.lint import Severity, check, find_faults
 from fleet.policy.plan.plan_parser import parse
@@ -190,6 +191,19 @@ def test_lint_warnings_of_partly_possible_plan_parts(text: str, told: str) -> No
         str(each) for each in found
     ]
     assert not [each for each in found if each.severity is Severity.ERROR]
+
+
+@pytest.mark.parametrize(
+    ("who", "told"),
+    [("all_cars", "no car has a color LED"), ("green", "green has no color LED"), ("red", "red has no color LED")],
+)
+def test_color_that_no_car_can_show_is_told(who: str, told: str) -> None:
+    fleet = {"red": replace(listed("arduino"), capabilities=frozenset({"tracking"})), "green": listed("stm32")}
+    plan = parse(SCOUT + f"rules: [{{when: {{car: red, is: light.left}}, then: {{who: {who}, led: red}}}}]")
+    found = [each for each in check(plan, fleet) if has_parts(each.words, f"never seen: {told}")]
+    assert [(each.severity, each.part) for each in found] == [(Severity.WARNING, "rule 1")]
+    able = {**fleet, "red" if who == "all_cars" else who: listed("arduino")}
+    assert not any("LED" in each.words for each in check(plan, able))
 
 
 @pytest.mark.parametrize(
