@@ -156,8 +156,8 @@ class LimitsEntry(Entry):
     )
     on_battery_low: BatteryAction = Field(
         default=BatteryAction.WARN,
-        description="reaction to a low battery. warn: log it; refuse: also refuse new drives and modes; stop: also "
-        "stop the car",
+        description="reaction to a low battery, while the car reports its voltage, mostly only in mode manual. "
+        "warn: log it; refuse: also refuse new drives and modes; stop: also stop the car",
     )
     on_battery_critical: BatteryAction = Field(
         default=BatteryAction.REFUSE, description="reaction to a critical battery, as for a low one"

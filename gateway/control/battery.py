@@ -71,6 +71,10 @@ class Battery(Struct):
     _since: float = 0.0
     """`_other` is the level that the readings show instead of `level`. Since `_since`, all readings have been on the
     same side of `level`: all worse, or all better."""
+    _rested_since: float | None = None
+    """The time of the first reading without a load after the start, or after the last one with a load."""
+    _is_settled: bool = False
+    """True once readings without a load have lasted `LEVEL_DEBOUNCE_S`, so that `level` follows from readings."""
 
     def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
         """Update the level with a measured voltage. Return True if it has changed; the first voltage changes none.
@@ -81,6 +85,13 @@ class Battery(Struct):
         self.measured_at = now
         if loaded:
             self._loaded_at = now
+        changed = self._update_level(voltage_v, now)
+        self._rested_since = None if self.loaded else now if self._rested_since is None else self._rested_since
+        if self._rested_since is not None and now - self._rested_since >= LEVEL_DEBOUNCE_S:
+            self._is_settled = True
+        return changed
+
+    def _update_level(self, voltage_v: float, now: float) -> bool:
         low_v, high_v = rest_v(voltage_v, loaded=self.loaded)
         worse, better = self.policy.level(high_v), self.policy.level(low_v - HYSTERESIS_V)
         if self.level is None:
@@ -129,8 +140,18 @@ class Battery(Struct):
     @property
     def refusal(self) -> str:
         """Return why new drives and modes are refused, or an empty text if they are allowed."""
-        refuses = self.action in (BatteryAction.REFUSE, BatteryAction.STOP)
-        return f"{self.words}. Charge it before driving. Manual, stop, whistle and light still work." if refuses else ""
+        action, words = self.action, self.words
+        if not self._is_settled and self.voltage_v is not None:
+            # A plan gives a car its mode as soon as it can, and in most modes a car reports no voltage. So do not wait
+            # until the level follows from readings.
+            shown = self.policy.level(self.voltage_v)
+            if self.level is not None and _LEVEL_RANK[shown] > _LEVEL_RANK[self.level]:
+                action, words = (
+                    self.policy.action(shown),
+                    f"battery {shown} by its first readings: {self.voltage_v:.2f} V",
+                )
+        refuses = action in (BatteryAction.REFUSE, BatteryAction.STOP)
+        return f"{words}. Charge it before driving. Manual, stop, whistle and light still work." if refuses else ""
 
 
 _LEVEL_RANK: Final = {each: rank for rank, each in enumerate(BatteryLevel)}

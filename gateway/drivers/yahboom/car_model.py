@@ -65,14 +65,19 @@ class CarModel:
         self.platform = PlatformDetector(self.profile, auto=self.auto)
         self.mode = ModeEstimator(self.profile, self.learned)
         self.evidence = StopEvidence(self.profile, self.learned)
-        self.battery = Battery(self.battery_policy.of_cells(self.profile.cells), self.profile.cells)
+        self.battery = self._battery()
         self.pacing = Pacing(self.profile, self.learned)
         self.believed = StateEstimate(self.profile, speeds=self.learned.speeds)
+
+    def _battery(self) -> Battery:
+        return Battery(self.battery_policy.of_cells(self.profile.cells), self.profile.cells)
 
     def treat_as(self, profile: Profile) -> None:
         """Use the profile of another platform from now on."""
         self.profile = self.mode.profile = self.pacing.profile = self.evidence.profile = profile
         self.believed = replace(self.believed, profile=profile)
+        if profile.cells != self.battery.cells:
+            self.battery = self._battery()
 
     def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
         """Update the trust state, and log each change. Only this function changes it."""

@@ -74,9 +74,21 @@ def test_first_battery_readings_count_after_holding(
 ) -> None:
     battery = Battery()
     assert not hear(battery, *[voltage_v] * 5)
-    assert (battery.level, battery.action, battery.refusal) == ("ok", None, "")
+    assert (battery.level, battery.action) == ("ok", None)
+    assert bool(battery.refusal) is refuses, "a mode would be open before the level follows from readings"
     assert bool(hear(battery, voltage_v)) is (expected != "ok")
     assert (battery.level, battery.action, bool(battery.refusal)) == (expected, action, refuses)
+
+
+def test_voltage_under_load_is_settled_only_after_a_rest() -> None:
+    battery = Battery()
+    hear(battery, 7.5, *[6.5] * 20, loaded=True)
+    assert (battery.level, bool(battery.refusal)) == (BatteryLevel.LOW, True), "without the load it may be critical"
+    assert "battery critical by its first readings: 6.50 V" in battery.refusal
+    hear(battery, *[7.5] * 20)
+    assert not battery.refusal
+    hear(battery, *[6.5] * 20, loaded=True)
+    assert (battery.level, battery.refusal) == (BatteryLevel.LOW, ""), "this battery is known, and only sags"
 
 
 def test_battery_level_changes_after_holding_not_by_one_reading() -> None:

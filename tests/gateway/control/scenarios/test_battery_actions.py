@@ -5,9 +5,12 @@ import pytest
 from gateway.control.battery import BatteryPolicy
 from gateway.control.commands import Drive, SetLight, SetMode, Stop
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from schemas.words import BatteryAction, Light, Mode, Motion, Phase, Reason
+from gateway.sim.model.traits import CarTraits
+from schemas.rights import Sender
+from schemas.words import BatteryAction, Light, Mode, Motion, Motors, Phase, Rank, Reason
 from tests.gateway.control.workbench import MODE00, REPORT_S, RUN, STOP, Workbench
 from tests.support.controls import control
+from tests.support.virtual import Pair
 
 FORWARD = Drive(Motion.FORWARD, 9.0)
 
@@ -40,6 +43,38 @@ def test_low_is_told_of_and_critical_refuses_what_drains_it() -> None:
     drained(desk, 8.0)
     assert desk.logs[-1].code == "battery_ok"
     assert desk.ask(FORWARD).status is Phase.QUEUED
+
+
+@pytest.mark.parametrize("platform", ["arduino", "stm32"])
+def test_empty_car_gets_no_mode_when_its_gateway_has_just_started(platform: str) -> None:
+    """A plan gives a mode as soon as the car is known. The car drove in it until it was empty, and reported nothing."""
+    pair = Pair(platform)
+    pair.car.drain(pair.now, 1.0)
+    pair.run(2.0, linked=False)
+    pair.connect()
+    model = pair.control.driver.model
+    pair.until(lambda: model.known and model.motors is Motors.OFF, 30.0)
+    refused = pair.ask(SetMode(Mode.OBSTACLE_AVOIDANCE), sender=Sender("coordinator", Rank.COORDINATOR))
+    assert (refused.status, refused.reason) == (Phase.REJECTED, Reason.BATTERY_LOW)
+    pair.run(30.0)
+    assert not pair.driven_since(0.0)
+    assert model.battery.level == "critical"
+
+
+@pytest.mark.parametrize("platform", ["auto", "arduino+3s"])
+def test_three_cells_count_also_if_they_were_detected(platform: str) -> None:
+    """The thresholds stayed those of two cells, so an empty battery of three cells counted as full."""
+    pair = Pair("arduino", traits=CarTraits(cells=3))
+    auto = platform == "auto"
+    pair.control = control(parse_platform("unknown" if auto else platform), auto=auto)
+    pair.connect()
+    pair.run(30.0)
+    model = pair.control.driver.model
+    assert (model.profile.name, model.battery.level) == ("arduino+3s", "ok")
+    pair.car.drain(pair.now, 60.0)
+    pair.run(90.0)
+    assert [log.code for log in pair.logs if log.code.startswith("battery")] == ["battery_low", "battery_critical"]
+    assert pair.ask(FORWARD).reason is Reason.BATTERY_LOW
 
 
 def test_car_can_be_stopped_by_its_battery() -> None:
