@@ -90,7 +90,9 @@ class RuleEntry(Entry):
     then: EffectEntry | list[EffectEntry] = Field(
         description="the effect: `{who: this_car, role: rest}`, or a list of effects"
     )
-    during: list[_Name] | None = Field(None, description="the phases in which the rule counts; left out: all")
+    during: list[_Name] | None = Field(
+        None, min_length=1, description="the phases in which the rule counts; left out: all"
+    )
 
 
 class FixedEntry(Entry):

@@ -166,6 +166,8 @@ class _PlanParser:
         effects = entry.then if isinstance(entry.then, list) else [entry.then]
         for place, phase in enumerate(entry.during or ()):
             self._check_phase((*where, "during", place), phase)
+        if not effects:
+            self._report((*where, "then"), "has no effect. Write one: `{who: this_car, role: rest}`", unless=where)
         self._mark("rule", entry.name or str(index + 1), where)
         return Rule(
             f"rule {entry.name or index + 1}",

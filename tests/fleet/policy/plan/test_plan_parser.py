@@ -98,6 +98,11 @@ ROLE = "roles: {a: {mode: tracking}, b: {mode: manual}}\n"
             ROLE + "rules: [{when: true, then: {who: red, mode: manual}}]",
             "rule 1, when: true … quotes or fields, `name: value`.",
         ),
+        (ROLE + "rules: [{when: light.left, then: []}]", "rule 1, then: has no effect. … who"),
+        (
+            ROLE + "phases: {p: {}}\nrules: [{when: light.left, then: {phase: p}, during: []}]",
+            "rule 1, during: has 0 items. … at least 1",
+        ),
         ("roles: {other_cars: {mode: tracking}}", "other_cars … word of rules"),
         ("roles: {a: {mode: tracking, cars: [all_cars]}}", "all_cars … word of rules"),
         (
