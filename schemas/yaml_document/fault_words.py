@@ -108,10 +108,8 @@ def describe_error(kind: str, error: Mapping[str, Any], where: Where, schema: Ma
         words = [str(word) for each in here for word in each.get("enum", [each["const"]] if "const" in each else [])]
         return (fault, suggest(str(value), words)) if words else (fault, f"Write {error['ctx']['expected']}.")
     if where and here and all(each.get("type") == "object" and "properties" in each for each in here):
-        return (
-            fault if value is None else "needs fields",
-            f"Write: `{where[-1]}: {_example(here[0], value, definitions)}`",
-        )
+        name = "- " if isinstance(where[-1], int) else f"{where[-1]}: "
+        return fault if value is None else "needs fields", f"Write: `{name}{_example(here[0], value, definitions)}`"
     allowed_here = [words for words in map(_describe_allowed, here) if words and words != "nothing"]
     kinds = ("_type", "_than", "_equal", "_parsing", "int_from_float", "enum", "literal_error")
     if allowed_here and kind.endswith(kinds):

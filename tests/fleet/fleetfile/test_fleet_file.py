@@ -89,6 +89,7 @@ def test_pins_have_the_conditions_of_plans() -> None:
         ("{when: range_m < 0}", "2:14", "never true"),
         ("{when: 'true'}", "2:14", "names no reading"),
         ("{when: range_m}", "2:14", "compare it"),
+        ("range_m < 0.1", "2:7", "pin 1: needs fields. Write: `- {when: …}`"),
         ("{before: 3s}", "2:7", "pin 1, when: is missing"),
         ("{when: range_m < 1, before: 2h}", "2:35", "at most 1h"),
         ("{when: range_m < 1, after: 0s}", "2:34", "at least 1s"),
