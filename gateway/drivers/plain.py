@@ -527,11 +527,11 @@ class PlainDriver(Driver):
             case SetMode(mode) if mode not in model.profile.modes:
                 return f"{car} ({model.profile.name}) has no mode {mode}. It has: manual."
             case ChangeSpeed(step):
-                share = model.speed + _STEPS[step]
-                if share > self.desk.speed_max + 1e-9 and step is SpeedStep.UP:
-                    maximum = self.desk.speed_max
-                    return f"{car} would drive at {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
-                return None
+                maximum = self.desk.speed_max
+                if step is SpeedStep.DOWN or model.speed < maximum - 1e-9:  # the last step up is shorter if needed
+                    return None
+                limit = " (speed_max)" if maximum < 1 else ""
+                return f"{car} drives at {maximum:.0%} of full speed already. That is its maximum{limit}."
             case PartAction() | Find() if not self.part_frames(what):
                 has = ", ".join(sorted(model.profile.capabilities))
                 return f"{car} ({model.profile.name}) cannot do that. It has: {has}."

@@ -127,6 +127,23 @@ def test_speed_max_limits_speed_from_start(speed_max: float) -> None:
         assert 0 < bench.moves()[-1][0] <= speed_max
 
 
+@pytest.mark.parametrize("speed_max", [0.15, 0.55, 0.75, 1.0])
+def test_speed_reaches_its_maximum_by_steps_up(speed_max: float) -> None:
+    bench = TankBench(speed_max)
+    bench.control.link_up(bench.now)
+    bench.run(1.0)
+    for step in (SpeedStep.DOWN, *[SpeedStep.UP] * 7):
+        last = bench.ask(ChangeSpeed(step))
+        bench.run(0.6)
+    refused = bench.last(last)
+    assert refused is not None
+    assert refused.phase is Phase.REJECTED
+    assert f"{speed_max:.0%} " in refused.words
+    assert ("speed_max" in refused.words) is (speed_max < 1.0)
+    bench.ask(Drive(Motion.FORWARD, 0.4))
+    assert bench.moves()[-1][0] == pytest.approx(speed_max)
+
+
 def test_action_without_frames_is_refused(bench: TankBench) -> None:
     find = bench.ask(Find())
     bench.run(1.0)
