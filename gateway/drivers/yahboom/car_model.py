@@ -87,7 +87,7 @@ class CarModel:
     def outputs(self) -> Outputs:
         """Return the estimated state of speed, fan and servo."""
         believed = self.believed
-        return Outputs(self.profile.speed.fraction(believed.speed), believed.fan, believed.servo_deg)
+        return Outputs(believed.share, believed.fan, believed.servo_deg)
 
     @property
     def findings(self) -> Findings:

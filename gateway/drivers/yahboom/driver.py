@@ -28,7 +28,7 @@ from gateway.control.driver import Desk, Event, Fields
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.car_monitor import CarMonitor
 from gateway.drivers.yahboom.estimate.learned import Learned
-from gateway.drivers.yahboom.estimate.outputs import kept_speeds, stepped
+from gateway.drivers.yahboom.estimate.outputs import joined, kept_speeds, share_of, stepped
 from gateway.drivers.yahboom.executor import Executor
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
@@ -168,27 +168,28 @@ class YahboomDriver(Executor):
 
     def _too_fast(self, step: SpeedStep) -> str | None:
         """Return why this step would make the car too fast, or None if it would not."""
-        speed, speeds = self.model.profile.speed, self.model.believed.speeds[self.model.profile.kind]
+        car, kind, speeds = self.desk.car, self.model.profile.kind, self.model.believed.speeds
         for each in self.queue.one_shots:
             if isinstance(each.command.what, ChangeSpeed):  # it waits, and may be written before this one, or expire
-                speeds = speeds | stepped(speed, speeds, each.command.what.step)
-        before, after = max(speeds), max(stepped(speed, speeds, step))
-        share, maximum = speed.fraction(after), self.desk.speed_max
-        if after <= before or share <= maximum:
+                speeds = joined(speeds, stepped(speeds, each.command.what.step))
+        share, maximum = share_of(stepped(speeds, step), kind), self.desk.speed_max
+        if share <= max(maximum, share_of(speeds, kind)):
             return None
-        car = self.desk.car
         return f"{car} would drive at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
 
     def _already_too_fast(self) -> str | None:
         """Return why the car may not be driven at its present speed, or None. Cars begin at a speed of their own."""
-        speed, maximum, car = self.model.profile.speed, self.desk.speed_max, self.desk.car
-        believed = self.model.believed
-        share, slowest = speed.fraction(believed.speed), speed.fraction(believed.slowest)
+        believed, maximum, car = self.model.believed, self.desk.speed_max, self.desk.car
+        share = believed.share
         if share <= maximum:
             return None
+        slowest = believed.slowest_share
         advice = f"`fleet speed {car} down` lowers it." if slowest <= maximum else f"Its slowest is {slowest:.0%}."
         drives = f"drives at about {share:.0%} of full speed"
-        if believed.speed_is_bound:
+        if self.model.profile.kind is Platform.UNKNOWN:
+            drives = f"may drive at up to {share:.0%} of full speed, because its platform is not known"
+            advice = f"Name it (`platform:` in the fleet file), or wait until it is detected. {advice}"
+        elif believed.speed_is_bound:
             cause = "because a mode or a restart of the car may have changed its speed"
             drives = f"may drive at up to {share:.0%} of full speed, {cause}"
         return f"{car} {drives}. Its maximum is {maximum:.0%} (speed_max). {advice}"

@@ -4,8 +4,8 @@ The car confirms none of them. Its readings are evidence only of its mode (see m
 
 *Speed.* A car has a speed from its start, and keeps it while the gateway or the link is gone, unless it is switched off
 meanwhile. So the estimate is a set of speeds that the car may have, one set for each kind of program, because the
-platform may be detected again. `speed_max` is compared with the highest of them. A step changes each of them, and
-several may become one again.
+platform may be detected again. `speed_max` is compared with the highest of them, and while the platform is unknown,
+with the highest for any platform. A step changes each of them, and several may become one again.
 """
 
 from collections.abc import Iterable, Mapping
@@ -46,14 +46,14 @@ class StateEstimate:
     speeds: Speeds = field(default_factory=speeds_at_start)
 
     @property
-    def speed(self) -> float:
-        """Return the highest speed that the car may have, in its own unit (see `SpeedModel`)."""
-        return max(self.speeds[self.profile.kind])
+    def share(self) -> float:
+        """Return the highest speed that the car may have, as a share of full speed."""
+        return share_of(self.speeds, self.profile.kind)
 
     @property
     def speed_is_bound(self) -> bool:
-        """Return True if the car may be slower than `speed`."""
-        return len(self.speeds[self.profile.kind]) > 1
+        """Return True if the car of a known platform may be slower than `share`."""
+        return len(self.speeds.get(self.profile.kind, ())) > 1
 
     def allow_restart(self) -> None:
         """Allow for a car that was switched off and on, and has the speed of its start now."""
@@ -67,7 +67,7 @@ class StateEstimate:
                     self.repeat = self.repeat or frame.motion is not self.motion
                 self.motion = frame.motion
                 if frame.speed is not None:
-                    self.speeds = {kind: stepped(SPEEDS[kind], at, frame.speed) for kind, at in self.speeds.items()}
+                    self.speeds = stepped(self.speeds, frame.speed)
                 if self.profile.fan_is_level:
                     self.fan_at = now if frame.fan is not self.fan else self.fan_at
                     self.fan = frame.fan
@@ -87,13 +87,12 @@ class StateEstimate:
                 pass
 
     @property
-    def slowest(self) -> float:
-        """Return the lowest value that steps down give `speed`."""
-        model, speeds = self.profile.speed, self.speeds[self.profile.kind]
-        seen = {speeds}
-        while (speeds := stepped(model, speeds, SpeedStep.DOWN)) not in seen:
-            seen.add(speeds)
-        return min(map(max, seen))
+    def slowest_share(self) -> float:
+        """Return the lowest value that steps down give `share`."""
+        speeds, seen = self.speeds, [self.speeds]
+        while (speeds := stepped(speeds, SpeedStep.DOWN)) not in seen:
+            seen.append(speeds)
+        return min(share_of(each, self.profile.kind) for each in seen)
 
     @property
     def fan_may_run(self) -> bool:
@@ -111,9 +110,19 @@ class StateEstimate:
         return replace(frame, fan=bool(self.fan))
 
 
-def stepped(model: SpeedModel, speeds: Iterable[float], step: SpeedStep) -> frozenset[float]:
+def stepped(speeds: Speeds, step: SpeedStep) -> Speeds:
     """Return the speeds that one step gives a car which has one of these speeds."""
-    return frozenset(model.step(speed, step) for speed in speeds)
+    return {kind: frozenset(SPEEDS[kind].step(speed, step) for speed in each) for kind, each in speeds.items()}
+
+
+def joined(one: Speeds, other: Speeds) -> Speeds:
+    """Return the speeds of a car which has a speed of either."""
+    return {kind: each | other[kind] for kind, each in one.items()}
+
+
+def share_of(speeds: Speeds, kind: Platform) -> float:
+    """Return the highest of these speeds as a share of full speed: of this platform, or of any if it is unknown."""
+    return max(SPEEDS[each].fraction(max(speeds[each])) for each in ((kind,) if kind in SPEEDS else SPEEDS))
 
 
 def _after_mode(model: SpeedModel, speeds: frozenset[float], mode: Mode) -> frozenset[float]:

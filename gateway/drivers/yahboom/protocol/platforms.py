@@ -99,7 +99,6 @@ SPEEDS: Final[Mapping[Platform, SpeedModel]] = {
     Platform.ARDUINO: ARDUINO_SPEED,
     Platform.STM32: STM32_SPEED,
     Platform.RASPBERRY_PI: RASPBERRY_PI_SPEED,
-    Platform.UNKNOWN: ARDUINO_SPEED,
 }
 
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters
@@ -493,7 +492,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _LIGHTS_2_TO_4,
                 _FRONT,
                 StopStyle.GENERAL,
-                SPEEDS[kind],
+                ARDUINO_SPEED,
                 constants=_CONSTANTS,
                 not_observed=("only what every known platform has is used",),
             )

@@ -94,6 +94,21 @@ def test_platform_that_is_detected_again_keeps_speed() -> None:
     assert _drive_as_fast_as_allowed(pair) <= 0.6
 
 
+@pytest.mark.parametrize("after_s", [0.0, 2.0, 6.0])
+def test_car_whose_platform_is_not_known_yet_may_be_the_fastest(after_s: float) -> None:
+    """A raspberry_pi car begins faster than others. It was driven like others until it was detected."""
+    pair = Pair("raspberry_pi", start_s=3.0)
+    pair.control = control(parse_platform("unknown"), auto=True, speed_max=0.6)
+    pair.connect()
+    pair.run(after_s)
+    refused = pair.ask(Drive(Motion.FORWARD, 3.0))
+    assert refused.status is Phase.REJECTED
+    assert "80%" in refused.words
+    pair.run(12.0)
+    assert not pair.driven_since(0.0)
+    assert _drive_as_fast_as_allowed(pair) <= 0.6
+
+
 @pytest.mark.parametrize("is_switched_off", [False, True])
 def test_car_that_was_switched_off_during_loss_of_link_begins_with_its_own_speed(*, is_switched_off: bool) -> None:
     pair = _limited("arduino", 0.4)
