@@ -4,9 +4,11 @@
 
 import argparse
 import importlib
+import os
 import sys
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
+from schemas import identity
 from schemas.battery_levels import CRITICAL_V, LOW_V
 from schemas.duration import parse_duration
 from schemas.keys import DEFAULT_FLEET, BadKey, check_name
@@ -47,12 +49,16 @@ Ctrl-C stops the car before the process ends."""
 def main() -> None:
     """Run the command line, and exit with 1 after a failure and with 2 after wrong use."""
     stdio.complete()
+    called = sys.argv[1] if sys.argv[1:] else ""
+    if os.environ.get("FLEET_LOG"):
+        from schemas.process import json_log
+
+        json_log.begin(f"gateway {called}" if called in COMMANDS else "gateway")
     parser = _GatewayParser(prog="gateway", description="Connects one robot car to the Zenoh bus.", epilog=_EPILOG)
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_run(commands)
     subparsers = {name: commands.add_parser(name, help=words) for name, (_, words) in COMMANDS.items()}
-    called = sys.argv[1] if sys.argv[1:] else ""
     if called not in COMMANDS:
         near = did_you_mean(called, ["run", *COMMANDS])
         if called != "run" and near:
@@ -283,7 +289,6 @@ def _opened(arguments: argparse.Namespace, car: str, url: "LinkUrl", platform: s
 
     Without the stop, the car might go on with its last command.
     """
-    from schemas import identity
     from schemas.bus import BadEndpoint, Bus, BusError, resolve_endpoint
 
     try:

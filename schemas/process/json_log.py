@@ -89,9 +89,11 @@ class _JsonLines(io.TextIOBase):
 
 
 def begin(process: str) -> bool:
-    """Let this process log as JSON if FLEET_LOG says so. Return True if it does."""
+    """Let this process log as JSON if FLEET_LOG says so, from the first call on. Return True if it does."""
     if not is_wanted():
         return False
+    if isinstance(sys.stderr, _JsonLines):
+        return True
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonFormatter(process))
     logging.basicConfig(handlers=[handler], level=logging.INFO, force=True)

@@ -1,6 +1,7 @@
 """Tests of the `gateway` command as a whole: help, wrong use, and the imports of `gateway run`."""
 
 import io
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,20 @@ def test_wrong_use_is_told(command: Command, arguments: list[str]) -> None:
     assert line.startswith("gateway: ")
     assert line.endswith(" --help)")
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    ["run --car red --link foo", "run --car red --lnk x", "monitor --link foo", "run --car red --link /dev/nope"],
+)
+def test_failures_are_json_lines_if_logs_are(command: Command, monkeypatch: pytest.MonkeyPatch, arguments: str) -> None:
+    monkeypatch.setenv("FLEET_LOG", "json")
+    done = command(*arguments.split())
+    assert done.returncode in (1, 2)
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    process = "gateway monitor" if arguments.startswith("monitor") else "gateway"
+    assert {line["process"] for line in lines} == {process}
+    assert lines[-1]["message"].startswith("gateway")
 
 
 @pytest.mark.parametrize(
