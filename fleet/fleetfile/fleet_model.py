@@ -184,7 +184,9 @@ class CommonEntry(Entry):
     )
     limits: LimitsEntry = Field(default_factory=LimitsEntry, description="limits of speed, time and battery")
     roles: list[_Name] = Field(
-        default_factory=list, description="the only roles of the plan that the car may have; left out: any"
+        default_factory=list,
+        description="the only roles of the plan that the car may have; left out: any. A rule may give it a mode "
+        "all the same",
     )
 
 
