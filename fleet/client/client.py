@@ -343,7 +343,7 @@ class Fleet:
         return self.ask(estop_request(why, Scope.FLEET if cars is None else Scope.CAR), cars)
 
     def resume(self, cars: Iterable[str] | None, ids: Sequence[str] = (), *, everything: bool = False) -> list[Outcome]:
-        """End the e-stops with these ids. Without ids, end the hold that a stop left.
+        """End the e-stops with these ids; a str is one id. Without ids, end the hold that a stop left.
 
         If `cars` is None, do this for every car. With `everything`, end the hold and every e-stop that this sender may
         end. If an e-stop or a hold remains, the outcome is not ok.

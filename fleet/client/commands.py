@@ -69,7 +69,11 @@ def drive_request(motion: str, duration_s: float = 0.5, *, wait: bool = True) ->
     """Request a motion for `duration_s` (at most 10 s, or the gateway's limit). With `wait`, wait until it ends."""
     if not hasattr(duration_s, "__float__"):  # text, from a caller without a type checker
         raise TypeError(f"duration {duration_s!r} is not allowed: write a number of seconds, such as 1.5")
-    if not (math.isfinite(duration_s) and 0 < duration_s <= MAX_DRIVE_S):
+    try:
+        duration_s = float(duration_s)  # a Decimal or a Fraction fails in arithmetic with floats
+    except OverflowError:
+        duration_s = math.inf
+    if not 0 < duration_s <= MAX_DRIVE_S:  # this also rejects NaN
         raise ValueError(
             f"duration {duration_s:g} s is not allowed: more than 0 and at most {MAX_DRIVE_S:g} s; "
             "for a longer drive, send the motion again"
@@ -150,10 +154,12 @@ def estop_request(why: str, scope: str) -> CommandRequest:
 
 
 def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
-    """Request the end of the e-stops with these ids. Without ids, request the end of the hold that a stop left.
+    """Request the end of the e-stops with these ids; a str is one id.
 
-    With `everything`, request the end of the hold and of all e-stops.
+    Without ids, request the end of the hold that a stop left. With `everything`, request the end of the hold and of all
+    e-stops.
     """
+    ids = [ids] if isinstance(ids, str) else ids  # otherwise each letter would be an id
     return CommandRequest(Verb.RESUME, pb.ResumeCommand(ids=ids, all=everything))
 
 
@@ -248,7 +254,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(estop_request(why, Scope.CAR))
 
     def resume(self, ids: Sequence[str] = (), *, everything: bool = False) -> R:
-        """End the e-stops with these ids. Without ids, end the hold that a stop left.
+        """End the e-stops with these ids; a str is one id. Without ids, end the hold that a stop left.
 
         With `everything`, end the hold and every e-stop that this sender may end.
         """

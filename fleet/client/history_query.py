@@ -23,7 +23,7 @@ def selector(key_expression: str, *, last: int | None = None, since_s: float | N
     """
     if last is None and since_s is None:
         raise ValueError("a history needs last (how many), since_s (how far back), or both")
-    if last is not None and last < 1:
+    if last is not None and (isinstance(last, bool) or not hasattr(last, "__index__") or last < 1):
         raise ValueError(f"last {last} is not allowed: it must be a whole number, at least 1")
     if since_s is not None and not 0 < since_s <= MAX_HISTORY_S:
         raise ValueError(f"since_s {since_s:g} is not allowed: more than 0 and at most {MAX_HISTORY_S:g} s")

@@ -4,8 +4,10 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from datetime import UTC, datetime
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import pytest
@@ -162,10 +164,22 @@ def test_client_that_disconnects_while_driving_leaves_no_car_driving(cars: Cars)
     assert "gone disconnected" in ended[0].words
 
 
-@pytest.mark.parametrize("duration_s", [0, -1, 3600.01, float("nan"), float("inf")])
+@pytest.mark.parametrize("duration_s", [0, -1, 3600.01, pytest.param(10**400, id="huge"), float("nan"), float("inf")])
 def test_drive_duration_out_of_range_is_refused_by_client(client: Fleet, duration_s: float) -> None:
     with pytest.raises(ValueError, match="more than 0 and at most 3600 s"):
         client.car("red").drive("forward", duration_s)
+
+
+@pytest.mark.parametrize("duration_s", [Decimal("0.2"), Fraction(1, 5)])
+def test_drive_lasts_any_number_of_seconds(client: Fleet, duration_s: float) -> None:
+    assert asked(lambda: client.car("green").drive("forward", duration_s)).ok
+
+
+def test_estop_ends_with_its_id_as_str(client: Fleet) -> None:
+    client.estop(["green"])
+    (estop,) = client.get("green/state/safety")[0].value.estops
+    released = client.car("green").resume(estop.id)
+    assert (released.ok, client.get("green/state/safety")[0]["estops"]) == (True, False), released
 
 
 def test_other_values_that_no_message_can_carry(client: Fleet) -> None:

@@ -204,8 +204,11 @@ def test_how_a_history_is_asked_for(last: int | None, since_s: float | None, sel
     assert history_query.selector("fleet/red/sensor/range", last=last, since_s=since_s) == selector
 
 
-@pytest.mark.parametrize(("last", "since_s"), [(None, None), (0, None), (None, 0.0), (None, float("nan"))])
-def test_history_of_nothing_is_refused(last: int | None, since_s: float | None) -> None:
+@pytest.mark.parametrize(
+    ("last", "since_s"),
+    [(None, None), (0, None), (1.5, None), (2.0, None), (True, None), (None, 0.0), (None, float("nan"))],
+)
+def test_history_of_nothing_is_refused(last: Any, since_s: float | None) -> None:
     with pytest.raises(ValueError, match=r"needs last|not allowed"):
         history_query.selector("fleet/red/sensor/range", last=last, since_s=since_s)
 
