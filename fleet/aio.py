@@ -7,7 +7,7 @@ import asyncio
 import time
 import weakref
 from collections.abc import Callable, Coroutine, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -68,19 +68,34 @@ class Fleet:
         self._client: client.Fleet | None = None
         self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="fleet-aio")
+        self._closed = False
 
     async def __aenter__(self) -> Self:
-        self._client = await self.call(self._open)
+        if self._closed:
+            raise client.closed_error()
+        opening = self._threads.submit(self._open)
+        try:
+            self._client = await asyncio.wrap_future(opening)
+        except asyncio.CancelledError:  # the thread goes on
+            opening.add_done_callback(_close_opened)
+            raise
         return self
 
     async def __aexit__(self, *_: object) -> None:
         for watch in list(self._watches):
             watch.close()
-        await self.call(self.sync.close)
+        closing = self._threads.submit(self.sync.close)
+        self._closed = True
         self._threads.shutdown(wait=False)
+        await asyncio.shield(asyncio.wrap_future(closing))
 
     async def call(self, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
-        """Run a blocking call in a thread. If the task is cancelled, a call that has begun still runs to its end."""
+        """Run a blocking call in a thread. If the task is cancelled, a call that has begun still runs to its end.
+
+        Raises BusError if this Fleet is closed.
+        """
+        if self._closed:  # the error of the executor does not help
+            raise client.closed_error()
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(function, *args, **options))
 
     @property
@@ -116,6 +131,7 @@ class Fleet:
         readings until the fleet is closed. Raises conditions.BadExpression.
         """
         key_expression = check_key(self.sync.expression(expression))
+        self.sync.check_open()
         watch = Watch(None if when is None else KeyCondition.of(when, key_expression).holds)
         watch.begin(self.sync.bus.subscribe(key_expression, watch.hand_over).undeclare)
         self._watches.add(watch)
@@ -129,7 +145,9 @@ class Fleet:
         key_expression = self.sync.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)
         try:
-            async with asyncio.timeout(timeout_s), self.watch(expression) as stream:
+            # The current reading counts, too, however short the wait is.
+            at_least_s = None if timeout_s is None else max(client.MIN_QUERY_TIMEOUT_S, timeout_s)
+            async with asyncio.timeout(at_least_s), self.watch(expression) as stream:
                 for reading in await self.get(expression):
                     if waiting.ends(reading, datetime.now(UTC)):
                         return reading
@@ -195,6 +213,12 @@ class Fleet:
         The command is sent at once, even if all threads are busy.
         """
         return await self.call(self.sync.outcomes, self.sync.send(request, cars))
+
+
+def _close_opened(opening: "Future[client.Fleet]") -> None:
+    """Close the client of an `async with` whose task was cancelled while the client was opened."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()
 
 
 class Car(CarCommands[Coroutine[Any, Any, Outcome]]):

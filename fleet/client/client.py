@@ -63,7 +63,7 @@ _EVENT: Final = topics.TOPICS["event/command"].message
 _MAX_STOP_THREADS: Final = 1024
 """Maximum number of threads for the queries of stops. Each query waits on its own thread. A stop of all cars makes two
 queries: to the gateways and to the supervisor."""
-_MIN_QUERY_TIMEOUT_S: Final = 0.1
+MIN_QUERY_TIMEOUT_S: Final = 0.1
 """Minimum timeout of the query for the current values, even if the wait itself is shorter."""
 
 log = logging.getLogger("fleet")
@@ -122,7 +122,7 @@ class Fleet:
     While a Fleet is open, it has the liveliness token `<fleet>/@operator/<sender>` on the bus. If the token disappears,
     for example because the program has crashed, gateways end the drives of this client, and stop these cars. Modes that
     it has opened go on. So use a Fleet in a `with` block, or call `close`. Otherwise the script ends with a
-    ResourceWarning.
+    ResourceWarning. A forked process needs a Fleet of its own: one from before the fork raises BusError there.
 
     Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
     """
@@ -179,6 +179,8 @@ class Fleet:
     def close(self) -> None:
         """Leave the bus. Every watch ends. The outcome of a command that is still under way is unknown then."""
         self._closed = True
+        if self.bus.is_of_other_process:  # the Fleet of the process that has forked stays open
+            return
         for watch in list(self._watches):
             watch.close()
         for command in list(self._pending.values()):
@@ -190,16 +192,18 @@ class Fleet:
         for pool in pools:
             pool.shutdown()
 
-    def _check_open(self) -> None:
-        """Raise BusError if the fleet is closed."""
+    def check_open(self) -> None:
+        """Raise BusError if the fleet is closed, or was opened by the process that has forked this one."""
         if self._closed:  # the errors that Zenoh and the pools would raise do not help
             raise closed_error()
+        if self.bus.is_of_other_process:  # Zenoh would wait for ever for its threads, which a fork does not copy
+            raise BusError("this Fleet was opened before this process was forked: open another one in this process")
 
     # ------------------------------------------------------------------ reading
 
     def cars(self) -> list[str]:
         """Return the names of the cars whose gateway is on the bus."""
-        self._check_open()
+        self.check_open()
         return [token.rpartition("/")[2] for token in self.bus.tokens(keys.car_token(self.name, "*"))]
 
     def car(self, name: str) -> "Car":
@@ -240,7 +244,7 @@ class Fleet:
         if "@cmd" in key_expression.split("/"):
             raise keys.BadKey(f"{key_expression} is a command, not a reading: a query of it would be carried out")
         check_key(key_expression)
-        self._check_open()
+        self.check_open()
         found = []
         for answer in self.bus.query(selector, timeout_s=timeout_s, qos=Qos.STATE):
             if isinstance(answer, Failure):
@@ -261,7 +265,7 @@ class Fleet:
         """
         key_expression = check_key(self.expression(expression))
         accept = None if when is None else KeyCondition.of(when, key_expression).holds
-        self._check_open()
+        self.check_open()
 
         def subscribe(on_sample: Callable[[Sample], None]) -> Callable[[], object]:
             return self.bus.subscribe(key_expression, on_sample).undeclare
@@ -285,11 +289,11 @@ class Fleet:
             return inf if timeout_s is None else began + timeout_s - time.monotonic()
 
         with self.watch(expression) as stream:  # before the query, so that no value in between is missed
-            for reading in self._read(key_expression, max(_MIN_QUERY_TIMEOUT_S, min(ANSWER_TIMEOUT_S, left_s()))):
+            for reading in self._read(key_expression, max(MIN_QUERY_TIMEOUT_S, min(ANSWER_TIMEOUT_S, left_s()))):
                 if waiting.ends(reading, datetime.now(UTC)):
                     return reading
             while (left := left_s()) > 0:
-                self._check_open()
+                self.check_open()
                 coming = stream.within(left)
                 if coming is not None and waiting.ends(coming, datetime.now(UTC), time.monotonic()):
                     return coming
@@ -317,7 +321,7 @@ class Fleet:
         ValueError for a value out of its range, keys.BadKey for a bad name, and BusError on a hub with certificates,
         unless this client has the certificate of `service.locator`.
         """
-        self._check_open()
+        self.check_open()
         message = pose_message(x_m, y_m, heading_rad, frame, xy_std_m, heading_std_rad)
         if not may_locate(self.bus.identity, check_car(car)):
             raise BusError(
@@ -375,7 +379,7 @@ class Fleet:
 
     def send(self, request: CommandRequest, cars: Iterable[str] | None = None) -> PendingCommand:
         """Send a command and return at once. To get its outcomes, pass the result to `outcomes`."""
-        self._check_open()
+        self.check_open()
         cars = [cars] if isinstance(cars, str) else cars  # "red" is an Iterable[str], too: r, e, d
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
         message, command_id = self._fill(request)

@@ -94,6 +94,10 @@ class LeasingFleet(Protocol):
     kind: str
     bus: Bus
 
+    def check_open(self) -> None:
+        """Raise BusError if the fleet is closed."""
+        ...
+
     def ask(self, request: CommandRequest, cars: Iterable[str] | None = None) -> list[Outcome]:
         """Send one command to these cars, and return their outcomes."""
         ...
@@ -112,13 +116,18 @@ class Lease(Generic[C_co]):
         self._name = name
         self._leased = leased
         self._take = take
-        self._monitor = LeaseMonitor(name, Sender(fleet.sender, rank_of(fleet.kind)))
+        self._monitor = self._new_monitor()
         self._monitor_lock = threading.Lock()
         self._over = threading.Event()
         self._undeclare: Any = lambda: None
-        self._renewer = threading.Thread(target=self._renew, name=f"fleet-lease-{name}", daemon=True)
+
+    def _new_monitor(self) -> LeaseMonitor:
+        return LeaseMonitor(self._name, Sender(self._fleet.sender, rank_of(self._fleet.kind)))
 
     def __enter__(self) -> C_co:
+        self._fleet.check_open()
+        # An earlier block with this lease may have lost it, and its thread may still run.
+        self._monitor, self._over = self._new_monitor(), threading.Event()
         key = keys.topic_key(self._fleet.name, self._name, "state/safety")
         self._undeclare = self._fleet.bus.subscribe(key, self._on_sample).undeclare
         try:
@@ -127,7 +136,8 @@ class Lease(Generic[C_co]):
         except BaseException:
             self._undeclare()
             raise
-        self._renewer.start()
+        name, arguments = f"fleet-lease-{self._name}", (self._monitor, self._over)
+        threading.Thread(target=self._renew, args=arguments, name=name, daemon=True).start()
         return self._leased(self)
 
     def __exit__(
@@ -170,14 +180,14 @@ class Lease(Generic[C_co]):
             raise NotCarriedOut(stopped, words)
         error.add_note(words)
 
-    def _renew(self) -> None:
+    def _renew(self, monitor: LeaseMonitor, over: threading.Event) -> None:
         """Renew the lease until it ends or is lost. Runs on its own thread."""
-        while not self._over.wait(LEASE_RENEWAL_INTERVAL_S) and not self._monitor.lost:
+        while not over.wait(LEASE_RENEWAL_INTERVAL_S) and not monitor.lost:
             try:
                 (outcome,) = self._fleet.ask(lease_request(), [self._name])
             except (BusError, RuntimeError):  # the Fleet is closed, and its token is gone
                 return
-            self._monitor.on_outcome(outcome)
+            monitor.on_outcome(outcome)
 
     def _query(self) -> None:
         """Query the car's safety state. Repeat for OUTCOME_MARGIN_S while the gateway does not answer."""

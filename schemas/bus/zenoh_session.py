@@ -175,6 +175,11 @@ class Bus:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def is_of_other_process(self) -> bool:
+        """True in a process that was forked from the one with the session. Zenoh's threads are not in it."""
+        return os.getpid() != self._pid
+
     def close(self) -> None:
         """Undeclare everything and close the session."""
         with signals.held_back():
@@ -189,7 +194,7 @@ class Bus:
                 thread.join(_THREAD_END_TIMEOUT_S)
 
     def _close_at_exit(self) -> None:
-        if os.getpid() == self._pid:  # a forked process has no session of its own
+        if not self.is_of_other_process:
             words = f"the session at {self.endpoint} was not closed: use `with`, or call close()"
             warnings.warn(words, ResourceWarning, stacklevel=1)
             self.close()

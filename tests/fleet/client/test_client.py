@@ -237,6 +237,25 @@ async def test_async_client_commands_and_watches(cars: Cars) -> None:
         assert (await client.resume(["red"]))[0].ok
 
 
+async def test_current_reading_counts_even_without_time_to_wait(client: Fleet, cars: Cars) -> None:
+    wanted = ("red/state/mode", "asked == 'manual'")
+    assert client.wait(*wanted, timeout_s=0).car == "red"
+    async with AsyncFleet(cars.endpoint, sender="eve") as other:
+        assert (await other.wait(*wanted, timeout_s=0)).car == "red"
+
+
+async def test_cancelled_opening_leaves_no_session(cars: Cars) -> None:
+    fleet = AsyncFleet(cars.endpoint, sender="eve")
+    opening = asyncio.create_task(fleet.__aenter__())
+    await asyncio.sleep(0)  # its thread begins
+    opening.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await opening
+    await asyncio.to_thread(fleet._threads.shutdown)
+    token = keys.operator_token("fleet", "eve")
+    await asyncio.to_thread(wait_for, lambda: not cars.bus.tokens(token), "it has left the bus")
+
+
 # ---------------------------------------------------------------- gateways that do not behave
 
 
@@ -453,6 +472,7 @@ def test_closed_fleet_raises_bus_error(cars: Cars) -> None:
         client.cars,
         client.stop,
         lambda: red.drive("forward", 0.2),
+        red.lease().__enter__,
         lambda: client.get("red"),
         lambda: client.history("red/sensor/range", last=1),
         lambda: client.watch("red/sensor/range"),
@@ -460,6 +480,28 @@ def test_closed_fleet_raises_bus_error(cars: Cars) -> None:
     for use in uses:
         with pytest.raises(BusError, match="is closed"):
             use()
+
+
+async def test_closed_async_fleet_raises_bus_error(cars: Cars) -> None:
+    client = AsyncFleet(cars.endpoint, sender="ann")
+    async with client:
+        red = client.car("red")
+        lease = red.lease()
+    uses: list[Callable[[], Awaitable[object]]] = [
+        client.cars,
+        client.stop,
+        lambda: red.drive("forward", 0.2),
+        lambda: red.lease().__aenter__(),
+        lease.__aenter__,
+        client.__aenter__,
+        lambda: client.get("red"),
+        lambda: client.history("red/sensor/range", last=1),
+        lambda: client.wait("red/sensor/range", "range_m > 0"),
+        lambda: anext(client.watch("red/sensor/range")),
+    ]
+    for use in uses:
+        with pytest.raises(BusError, match="is closed"):
+            await use()
 
 
 def test_missing_fleet_and_bad_names_have_own_errors() -> None:

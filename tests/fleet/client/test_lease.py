@@ -170,6 +170,21 @@ def test_lease_is_renewed_until_block_ends(fleet: Fleet, cars: Cars) -> None:
         assert error.value.outcome.reason == "leased"
 
 
+def test_lease_can_be_used_again_even_if_it_was_lost(fleet: Fleet, cars: Cars) -> None:
+    lease = fleet.car("green").lease()
+    with (
+        Fleet(cars.endpoint, sender="mia", kind="person") as mia,
+        lease as car,
+        mia.car("green").lease(),
+        pytest.raises(LeaseLost),
+    ):
+        go_on(car)
+    with lease as car:
+        assert car.light("red").ok
+        assert holder(cars, "green") == "bot"
+    assert holder(cars, "green") == ""
+
+
 @pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit])
 def test_lease_exit_by_exception_stops_car(fleet: Fleet, cars: Cars, error: type[BaseException]) -> None:
     def block() -> None:

@@ -29,6 +29,22 @@ WORKER = (
 )
 
 
+FORK = (
+    "import os, signal\nfrom fleet import Fleet\nfrom schemas.bus import BusError\n"
+    "with Fleet(sender='mia') as fleet, fleet.watch('*/sensor/range'):\n"
+    "    if child := os.fork():\n"
+    "        print(os.waitpid(child, 0)[1], fleet.cars())\n"
+    "    else:\n"
+    f"        signal.alarm({PATIENCE_S / 2:.0f})\n"
+    "        for use in (fleet.cars, fleet.stop, fleet.car('red').lease().__enter__):\n"
+    "            try:\n"
+    "                use()\n"
+    "            except BusError as error:\n"
+    "                print(error, flush=True)\n"
+)
+"""The forked process uses the Fleet, and leaves its block."""
+
+
 def run(endpoint: str, *arguments: str, script: str = "") -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, *arguments]
     env = os.environ | {"FLEET_ENDPOINT": endpoint}
@@ -71,3 +87,11 @@ def test_script_with_unclosed_fleet_ends_with_resource_warning(
 def test_closed_one_is_not_complained_about(endpoint: str) -> None:
     done = run(endpoint, "-W", "error::ResourceWarning", "-c", f"{OPEN}fleet.close()")
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_forked_process_is_told_to_open_its_own_and_ends(endpoint: str) -> None:
+    done = run(endpoint, "-W", "error::ResourceWarning", "-c", FORK)
+    assert (done.returncode, done.stderr) == (0, "")
+    *told, parent = done.stdout.splitlines()
+    assert ["forked" in each for each in told] == [True] * 3, told
+    assert parent == "0 []", "its own Fleet is still open"

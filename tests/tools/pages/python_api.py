@@ -55,7 +55,7 @@ _ERRORS = (
     QueryFailed,
     FormatMissing,
 )
-_HIDDEN = {"do", "ask", "call", "begin", "expression"}
+_HIDDEN = {"do", "ask", "call", "begin", "expression", "check_open"}
 """Methods for the package's own use."""
 _INTERNAL = {
     *((Lease, name) for name in ("check", "checked")),
