@@ -16,6 +16,8 @@ from fleet.client.outcome_words import ESTOP_FLEET, RELEASE
 from schemas import keys, messages
 from schemas.commands import COMMANDS, Verb
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.limits import MAX_REASON_LENGTH
+from schemas.process.stdio import printable
 from schemas.words import Motion, Scope
 
 R = TypeVar("R")
@@ -150,7 +152,7 @@ def stop_request() -> CommandRequest:
 
 def estop_request(why: str, scope: str) -> CommandRequest:
     """Request an e-stop. `scope` is car or fleet."""
-    return CommandRequest(Verb.ESTOP, pb.EstopCommand(why=why, scope=scope), Until.STOPPED)
+    return CommandRequest(Verb.ESTOP, pb.EstopCommand(why=_reason(why), scope=scope), Until.STOPPED)
 
 
 def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> CommandRequest:
@@ -165,7 +167,7 @@ def resume_request(ids: Sequence[str] = (), *, everything: bool = False) -> Comm
 
 def pause_request(why: str = "") -> CommandRequest:
     """Request a stop, and a pause of the whole fleet."""
-    return CommandRequest(Verb.PAUSE, pb.PauseCommand(why=why), Until.STOPPED)
+    return CommandRequest(Verb.PAUSE, pb.PauseCommand(why=_reason(why)), Until.STOPPED)
 
 
 def lend_request(to: str, duration_s: float) -> CommandRequest:
@@ -176,6 +178,11 @@ def lend_request(to: str, duration_s: float) -> CommandRequest:
 def end_loan_request() -> CommandRequest:
     """Request the end of a loan."""
     return CommandRequest(Verb.LEND, pb.LendCommand(end=True))
+
+
+def _reason(why: object) -> str:
+    """Return what a gateway stores of a reason. A reason that no message can carry must not make an e-stop fail."""
+    return printable(str(why or "")[:MAX_REASON_LENGTH], " ")
 
 
 def _check_range(name: str, value: int, top: int) -> None:

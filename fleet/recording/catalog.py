@@ -11,6 +11,7 @@ A view is defined only when a question names it or asks which views there are, b
 thousand sessions have twenty files each.
 """
 
+import os
 import re
 import shutil
 import tempfile
@@ -87,6 +88,8 @@ class Catalog:
             raise FormatMissing("duckdb") from None
         self._duckdb = duckdb
         self.directory = Path(directory) if directory is not None else sessions_place()
+        if directory is not None:
+            os.scandir(directory).close()  # a wrong one is no directory without sessions
         self.damage: dict[str, str] = {}
         """By name of a session: the parts that could not be read, in words."""
         self.unanswered: dict[str, str] = {}

@@ -15,7 +15,7 @@ import zenoh
 
 from fleet.aio import Fleet as AsyncFleet
 from fleet.client.client import Fleet
-from fleet.client.commands import led_request
+from fleet.client.commands import led_request, pause_request
 from fleet.client.outcome import Outcome
 from schemas import keys, messages, topics
 from schemas.bus import BadEndpoint, Bus, BusError, NoFleet, reply
@@ -180,6 +180,15 @@ def test_estop_ends_with_its_id_as_str(client: Fleet) -> None:
     (estop,) = client.get("green/state/safety")[0].value.estops
     released = client.car("green").resume(estop.id)
     assert (released.ok, client.get("green/state/safety")[0]["estops"]) == (True, False), released
+
+
+@pytest.mark.parametrize("why", [pytest.param("w" * 70_000, id="long"), "smoke \udcff", 7])
+def test_no_reason_makes_estop_or_pause_fail(client: Fleet, cars: Cars, why: Any) -> None:
+    (outcome,) = client.estop(["green"], why)
+    assert outcome.ok, outcome
+    assert cars.state("safety", "green").estops[0].why.startswith(str(why)[:5])
+    assert all(each.ok for each in client.resume(["green"], everything=True))
+    assert pause_request(why).message.ByteSize() < 1000, "more than 64 KiB would be refused"
 
 
 def test_other_values_that_no_message_can_carry(client: Fleet) -> None:

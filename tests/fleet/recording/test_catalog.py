@@ -115,6 +115,12 @@ def test_view_exists_for_topic_without_messages(sessions: Path) -> None:
     assert "session" in found["sensor_wheels"]
 
 
+def test_directory_that_cannot_be_listed_has_no_answers(sessions: Path) -> None:
+    for wrong in (sessions / "nowhere", sessions / "one" / "0001.mcap"):
+        with pytest.raises(OSError, match=wrong.name):
+            Catalog(wrong)
+
+
 @pytest.mark.parametrize("sql", ["SELECT nothing FROM sensor_range", "nonsense", "SELECT * FROM nowhere", ""])
 def test_bad_query_is_refused_in_one_line(sessions: Path, sql: str) -> None:
     if not sql:
