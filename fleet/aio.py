@@ -84,10 +84,10 @@ class Fleet:
     async def __aexit__(self, *_: object) -> None:
         for watch in list(self._watches):
             watch.close()
-        closing = self._threads.submit(self.sync.close)
+        closing = asyncio.get_running_loop().run_in_executor(None, self.sync.close)  # ours may all be busy
         self._closed = True
         self._threads.shutdown(wait=False)
-        await asyncio.shield(asyncio.wrap_future(closing))
+        await asyncio.shield(closing)
 
     async def call(self, function: Callable[P, T], *args: P.args, **options: P.kwargs) -> T:
         """Run a blocking call in a thread. If the task is cancelled, a call that has begun still runs to its end.

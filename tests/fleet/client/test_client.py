@@ -22,7 +22,7 @@ from schemas.bus import BadEndpoint, Bus, BusError, NoFleet, reply
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.conftest import Cars, asked
 from tests.support.ports import free_endpoint
-from tests.support.processes import LONG_S, driving, wait_for
+from tests.support.processes import LONG_S, PATIENCE_S, driving, wait_for
 
 
 @pytest.fixture
@@ -263,6 +263,15 @@ async def test_cancelled_opening_leaves_no_session(cars: Cars) -> None:
     await asyncio.to_thread(fleet._threads.shutdown)
     token = keys.operator_token("fleet", "eve")
     await asyncio.to_thread(wait_for, lambda: not cars.bus.tokens(token), "it has left the bus")
+
+
+async def test_close_does_not_wait_for_free_thread(cars: Cars) -> None:
+    free = threading.Event()
+    async with AsyncFleet(cars.endpoint, sender="eve") as fleet:
+        waiting = asyncio.gather(*(fleet.call(free.wait, PATIENCE_S) for _ in range(300)))
+        await asyncio.to_thread(wait_for, fleet._threads._work_queue.qsize, "all threads are busy")
+    free.set()
+    assert all(await waiting), "none of them had to time out"
 
 
 # ---------------------------------------------------------------- gateways that do not behave
