@@ -64,11 +64,11 @@ MODES: Final[Mapping[Mode, ModeRow]] = {
     Mode.MANUAL: ModeRow(0, 0.0, 1.0, rate_hz=1.0, measures=EVERY_MEASUREMENT),
     # docs/reference/protocol.md has no turn time for this mode: assumed as in the modes that only read pins
     Mode.REMOTE_CONTROL: ModeRow(1, _open_s(1), 0.1),
-    Mode.TRACKING: ModeRow(2, _open_s(2), 0.1, 27.0, frozenset({"line"}), _signature(_TRACKING)),
+    Mode.TRACKING: ModeRow(2, _open_s(2), 0.12, 27.0, frozenset({"line"}), _signature(_TRACKING)),
     # near an obstacle, a turn takes 4.3 s; without any echo it never ends, and the motors are braked
     Mode.OBSTACLE_AVOIDANCE: ModeRow(3, _open_s(3), 4.3, measures=frozenset({"range"}), signature=_AVOIDING),
     Mode.COLOR_LED: ModeRow(4, _open_s(4), 0.75),
-    Mode.LIGHT_SEEKING: ModeRow(5, _open_s(5), 0.1, 23.0, frozenset({"light"}), _signature(_SEEKING)),
+    Mode.LIGHT_SEEKING: ModeRow(5, _open_s(5), 0.11, 23.0, frozenset({"light"}), _signature(_SEEKING)),
     Mode.FOLLOWING: ModeRow(6, _open_s(6), 0.1, 24.0, frozenset({"obstacle"}), _signature(_FOLLOWING), has_end=False),
 }
 
