@@ -86,8 +86,11 @@ class Battery(Struct):
         if loaded:
             self._loaded_at = now
         changed = self._update_level(voltage_v, now)
-        self._rested_since = None if self.loaded else now if self._rested_since is None else self._rested_since
-        if self._rested_since is not None and now - self._rested_since >= LEVEL_DEBOUNCE_S:
+        if self.loaded:
+            self._rested_since = None
+        elif self._rested_since is None:
+            self._rested_since = now
+        elif now - self._rested_since >= LEVEL_DEBOUNCE_S:
             self._is_settled = True
         return changed
 
@@ -146,10 +149,8 @@ class Battery(Struct):
             # until the level follows from readings.
             shown = self.policy.level(self.voltage_v)
             if self.level is not None and _LEVEL_RANK[shown] > _LEVEL_RANK[self.level]:
-                action, words = (
-                    self.policy.action(shown),
-                    f"battery {shown} by its first readings: {self.voltage_v:.2f} V",
-                )
+                action = self.policy.action(shown)
+                words = f"battery {shown} by its first readings: {self.voltage_v:.2f} V"
         refuses = action in (BatteryAction.REFUSE, BatteryAction.STOP)
         return f"{words}. Charge it before driving. Manual, stop, whistle and light still work." if refuses else ""
 

@@ -207,15 +207,11 @@ class Fails(tank.TankDriver):
         raise ZeroDivisionError
 
 
-class Types(tank.TankDriver):
+class Types(NakedStop):
     """Writes text, not bytes."""
 
     def motion_frame(self, motion: Motion) -> Any:
         return super().motion_frame(motion).decode()
-
-    def stop_frame(self, index: int) -> Any:
-        del index
-        return self.motion_frame(Motion.STOP)
 
 
 class Texts(tank.TankDriver):

@@ -60,7 +60,7 @@ _HORIZONTAL: Final = frozenset(
 
 
 class SpeedModel(Struct, frozen=True):
-    """What is known of the speed, in the car's own unit. The gateway counts the steps."""
+    """The speeds of one kind of program and its steps, in the car's own unit."""
 
     start: float
     increment: float
