@@ -86,20 +86,18 @@ class SpeedModel(Struct, frozen=True):
 _BY_PERSON: Final = frozenset({Mode.REMOTE_CONTROL})
 # The Arduino program sets the speed itself in these modes, and keeps it afterwards.
 _BY_PROGRAM: Final = frozenset({Mode.TRACKING, Mode.OBSTACLE_AVOIDANCE, Mode.LIGHT_SEEKING, Mode.FOLLOWING})
-# platforms: speed. Arduino 150 of 255, +-50, ceiling 255, a step down to less than 50 becomes 100
-ARDUINO_SPEED: Final = SpeedModel(
-    start=150, increment=50, low=50, rebound=100, top=255, set_by=_BY_PERSON | _BY_PROGRAM
-)
-# programs that people have: 200 of 1000, steps of 100. The slowest speed was not measured: one step is assumed
-STM32_SPEED: Final = SpeedModel(start=200, increment=100, low=100, rebound=100, top=1000, set_by=_BY_PERSON)
-# platforms: speed. Raspberry Pi +-20 in 20..100 %. The start is 80 % in one program and 50 % in another. The faster one
-# is assumed, so that no car exceeds `speed_max`
-RASPBERRY_PI_SPEED: Final = SpeedModel(start=80, increment=20, low=20, rebound=20, top=100, set_by=frozenset())
 SPEEDS: Final[Mapping[Platform, SpeedModel]] = {
-    Platform.ARDUINO: ARDUINO_SPEED,
-    Platform.STM32: STM32_SPEED,
-    Platform.RASPBERRY_PI: RASPBERRY_PI_SPEED,
+    # platforms: speed. Arduino 150 of 255, +-50, ceiling 255, a step down to less than 50 becomes 100
+    Platform.ARDUINO: SpeedModel(
+        start=150, increment=50, low=50, rebound=100, top=255, set_by=_BY_PERSON | _BY_PROGRAM
+    ),
+    # programs that people have: 200 of 1000, steps of 100. The slowest speed was not measured: one step is assumed
+    Platform.STM32: SpeedModel(start=200, increment=100, low=100, rebound=100, top=1000, set_by=_BY_PERSON),
+    # platforms: speed. Raspberry Pi +-20 in 20..100 %. The start is 80 % in one program and 50 % in another. The faster
+    # one is assumed, so that no car exceeds `speed_max`
+    Platform.RASPBERRY_PI: SpeedModel(start=80, increment=20, low=20, rebound=20, top=100, set_by=frozenset()),
 }
+"""What each kind of program does with the speed. While the platform is unknown, the fastest of them counts."""
 
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters
 _PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0
@@ -147,7 +145,6 @@ class Profile(Struct, frozen=True, dict=True):
     lights: frozenset[Light]
     servos: frozenset[ServoAction]
     stop_style: StopStyle
-    speed: SpeedModel
     constants: tuple[tuple[str, float], ...] = ()  # readings that are constants in mode 0
     not_observed: tuple[str, ...] = ()  # properties that were only read or assumed, for a person
 
@@ -456,7 +453,6 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _ALL_LIGHTS,
                 _FRONT,
                 StopStyle.MODE_FRAME,
-                SPEEDS[kind],
             )
         case Platform.STM32:
             return Profile(
@@ -467,7 +463,6 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _STM32_LIGHTS,
                 _FRONT,
                 StopStyle.TIMER,
-                SPEEDS[kind],
                 not_observed=("the slowest speed", "readings while the fan runs"),
             )
         case Platform.RASPBERRY_PI:
@@ -479,7 +474,6 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _LIGHTS_2_TO_4,
                 _FRONT | _VERTICAL | _HORIZONTAL,
                 StopStyle.GENERAL,
-                SPEEDS[kind],
                 constants=_CONSTANTS,
                 not_observed=("the speed at the start",),
             )
@@ -492,7 +486,6 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _LIGHTS_2_TO_4,
                 _FRONT,
                 StopStyle.GENERAL,
-                ARDUINO_SPEED,
                 constants=_CONSTANTS,
                 not_observed=("only what every known platform has is used",),
             )

@@ -5,8 +5,8 @@ import pytest
 from gateway.control.commands import ChangeSpeed, Drive
 from gateway.drivers.yahboom.estimate.outputs import StateEstimate
 from gateway.drivers.yahboom.protocol.frames import General, ModeOpen
-from gateway.drivers.yahboom.protocol.platforms import parse_platform
-from schemas.words import Mode, Motion, SpeedStep
+from gateway.drivers.yahboom.protocol.platforms import SPEEDS, parse_platform
+from schemas.words import Mode, Motion, Platform, SpeedStep
 from tests.support.controls import control
 
 
@@ -68,7 +68,7 @@ def test_speed_that_a_mode_has_set_is_lowered_before_a_drive(limit: float, steps
 @pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.MANUAL])
 def test_car_is_never_faster_than_believed(platform: str, mode: Mode) -> None:
     """Whatever a mode has left, each step down keeps the estimate at or above the car's speed."""
-    speed = parse_platform(platform).speed
+    speed = SPEEDS[Platform(platform)]
     left = range(int(speed.top) + 1) if mode in speed.set_by else [speed.start]
     for true_speed in left:
         believed, true = StateEstimate(parse_platform(platform)), float(true_speed)

@@ -18,7 +18,7 @@ from gateway.drivers.yahboom.protocol.frames import (
 )
 from gateway.drivers.yahboom.protocol.measurements import verdict_of
 from gateway.drivers.yahboom.protocol.modes import EVERY_MEASUREMENT, MODES, candidate_modes, only_candidate
-from gateway.drivers.yahboom.protocol.platforms import StopStyle, parse_platform
+from gateway.drivers.yahboom.protocol.platforms import SPEEDS, StopStyle, parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.protocol.timing import FRAME_S, LONGEST_BLOCK_S, RECOVERY_SILENCE_S
 from schemas.platform_name import OPTION_WORDS
@@ -123,7 +123,7 @@ def test_platform_contradictions(row: dict[str, str], platform: str) -> None:
 
 @pytest.mark.parametrize("row", SPEED, ids=ids(SPEED))
 def test_speed_is_counted_in_steps(row: dict[str, str]) -> None:
-    model = parse_platform(row["platform"]).speed
+    model = SPEEDS[Platform(row["platform"])]
     value, values = model.start, []
     for word in row["steps"].split():
         value = model.step(value, SpeedStep(word))
