@@ -494,7 +494,10 @@ class Driver(ABC):
     def on_voltage(self, voltage_v: float, now: float) -> None:
         """Update the battery, and stop the car if the policy requires it. A driver calls it with each voltage."""
         model = self.model
-        if not model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now):
+        changed = model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now)
+        if refusal := model.battery.refusal:
+            self._reject_waiting(Reason.BATTERY_LOW, refusal, now)
+        if not changed:
             return
         level, words = model.battery.level, f"{model.name}: {model.battery.words}"
         severity = {BatteryLevel.LOW: Level.WARNING, BatteryLevel.CRITICAL: Level.ERROR}
@@ -502,6 +505,13 @@ class Driver(ABC):
         if model.battery.action is BatteryAction.STOP and not model.at_rest:
             self.halt(words, now)
             self.stop_if_open(now)
+
+    def _reject_waiting(self, reason: Reason, words: str, now: float) -> None:
+        """Reject the drive and the mode that were accepted but still wait, because the car must not begin them now."""
+        held = self.queue.held
+        if held is not None and held.began_at is None:
+            self.release(Phase.REJECTED, reason, words, now)
+        self.queue.close_mode_change(Phase.REJECTED, reason, words, now)
 
     def halt(self, words: str, now: float, by: str = "") -> None:
         """Drop all commands, and shorten the lease. Refuse the drives of each sender that has just driven.

@@ -61,6 +61,25 @@ def test_empty_car_gets_no_mode_when_its_gateway_has_just_started(platform: str)
     assert model.battery.level == "critical"
 
 
+@pytest.mark.parametrize("what", [FORWARD, SetMode(Mode.TRACKING)])
+def test_accepted_command_that_waits_for_car_is_not_begun_with_critical_battery(what: Drive | SetMode) -> None:
+    """A mode that waited for the car was opened, and the car drove in it until it was empty."""
+    desk = Workbench().ready()
+    drained(desk, 6.9)
+    for _ in range(5):  # the next reading makes the battery critical
+        desk.run(REPORT_S, reports=False)
+        desk.hear(reading(6.1))
+    desk.run(REPORT_S, reports=False)
+    desk.ask(SetLight(Light.RED))
+    assert desk.ask(what, identity="w").status is Phase.QUEUED
+    desk.hear(reading(6.1))
+    assert desk.logs[-1].code == "battery_critical"
+    assert desk.end("w") == (Phase.REJECTED, Reason.BATTERY_LOW)
+    desk.run(10.0)
+    assert RUN not in desk.frames
+    assert b"$MODE20#" not in desk.frames
+
+
 @pytest.mark.parametrize("platform", ["auto", "arduino+3s"])
 def test_three_cells_count_also_if_they_were_detected(platform: str) -> None:
     """The thresholds stayed those of two cells, so an empty battery of three cells counted as full."""
