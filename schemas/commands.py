@@ -74,7 +74,7 @@ _ROWS: Final = (
     CommandType(Verb.MODE, "bring the car into a mode; `manual` closes the open mode", "switching to mode{detail}"),
     CommandType(Verb.LED, "set the color LED: red, green and blue, 0..255 each", "LED color sent"),
     CommandType(Verb.LIGHT, "set the light's color, or `off`", "light{detail} sent"),
-    CommandType(Verb.SERVO, "move a servo by one step, or the front servo to `deg` (0..180)", "servo movement sent"),
+    CommandType(Verb.SERVO, "turn a servo (`action`), or the front servo to `deg` (0..180)", "servo movement sent"),
     CommandType(Verb.ARM, "move the six joints of the arm, 0..180 degrees each (option `+arm`)", "arm joints sent"),
     CommandType(
         Verb.WHISTLE,

@@ -226,7 +226,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(light_request(light))
 
     def servo(self, servo: str, action: str = "", deg: int | None = None) -> R:
-        """Move a servo by one step, or to its middle (`reset`).
+        """Turn a servo: the front servo to its end, those of a camera by one step, each to its middle (`reset`).
 
         `servo` is `front` or `horizontal`, with the actions left, right and reset; or `vertical`, with up, down and
         reset. Instead of an action, `front` accepts an angle: `deg`, 0..180.

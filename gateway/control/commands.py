@@ -62,7 +62,7 @@ class Signal(PartAction, frozen=True):
 
 
 class MoveServo(PartAction, frozen=True):
-    """Move a servo by one step, or to its middle."""
+    """Turn a servo by one step or to an end, as its car does, or to its middle."""
 
     action: ServoAction
 
