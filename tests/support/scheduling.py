@@ -37,6 +37,9 @@ _MIN_WAITING: Final = 1000
 """Minimum number of tests that do not only compute, for workers of different kinds. With fewer, all workers are of the
 foreground: beside workers that compute, those in the background would get no time."""
 _LOWEST_PRIORITY: Final = 19
+_COMPUTING_TIMEOUT_S: Final = 600
+"""Timeout of a test that computes. In the background it waits for all other processes: on a machine with other work, a
+test of 6 s took more than the 120 s of the other tests."""
 _ASSIGNED_TOGETHER: Final = 8
 """Number of short tests of a file that one worker gets with one message. With a message for each test, the messages and
 the bookkeeping of pytest-xdist took as long as 4,000 of its shortest tests."""
@@ -99,9 +102,15 @@ def computes(nodeid: str) -> bool:
 
 
 def sort(items: list[pytest.Item]) -> None:
-    """Put tests that compute last, where workers in the background take them. Put large groups and slow files first."""
+    """Put tests that compute last, where workers in the background take them. Put large groups and slow files first.
+
+    Give tests that compute more time, too.
+    """
     groups = {item: _group(item) for item in items}
     sizes = Counter(filter(None, groups.values()))
+    for item in items:
+        if computes(item.nodeid) and item.get_closest_marker("timeout") is None:
+            item.add_marker(pytest.mark.timeout(_COMPUTING_TIMEOUT_S))
     items.sort(key=lambda item: (computes(item.nodeid), -sizes[groups[item]], not item.nodeid.startswith(_SLOW)))
 
 
