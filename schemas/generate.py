@@ -11,7 +11,11 @@ GENERATED = HERE / "gen"
 
 
 def generate(out: Path) -> list[Path]:
-    """Run protoc on every .proto file. Return the files that it wrote into `out`."""
+    """Run protoc on every .proto file. Return the files that it wrote into `out`.
+
+    Protoc takes a generated module for one of the top level. Its classes get the name of the module that we import,
+    else their messages cannot be pickled, and so not be returned by another process.
+    """
     from grpc_tools import protoc  # type: ignore[import-untyped]  # ships no types
 
     includes = [f"-I{SOURCES}", f"-I{resources.files('grpc_tools') / '_proto'}"]
@@ -19,6 +23,9 @@ def generate(out: Path) -> list[Path]:
     code = protoc.main(["protoc", *includes, f"--python_out={out}", f"--pyi_out={out}", *sources])
     if code != 0:
         raise SystemExit(code)
+    for path in out.glob("*_pb2.py"):
+        here = f"'{path.stem}', _globals"
+        path.write_text(path.read_text().replace(here, f"'schemas.gen.{path.stem}', _globals"))
     return sorted(path for path in out.iterdir() if path.name.split(".")[0].endswith("_pb2"))
 
 

@@ -9,6 +9,7 @@ from typing import Final, Self
 from fleet.client.claims import NOT_STOPPED
 from fleet.client.outcome_words import NEXT_STEPS, STOP_VERBS, UNCONFIRMED, describe, with_code
 from schemas.limits import MAX_EVIDENCE_TIMEOUT_S, MAX_QUEUE_TIME_S
+from schemas.picklable import Picklable
 from schemas.suggestion import did_you_mean
 from schemas.words import Basis, Phase, Reason
 
@@ -97,7 +98,7 @@ class Outcome:
         return with_code(named, self.code)
 
 
-class NotCarriedOut(Exception):
+class NotCarriedOut(Picklable, Exception):
     """A command was not carried out. `outcome` contains the car and the reason."""
 
     def __init__(self, outcome: Outcome, words: str = "") -> None:

@@ -10,11 +10,12 @@ from fleet.client.reading import Reading
 from fleet.conditions import compared_in
 from fleet.conditions.holding import CLOCK_STEP_S, Holding
 from schemas import topics
+from schemas.picklable import Picklable
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-class NotInTime(TimeoutError):
+class NotInTime(Picklable, TimeoutError):
     """The condition did not hold in time. `last` is the newest reading, if there was one."""
 
     def __init__(self, words: str, last: Reading | None) -> None:

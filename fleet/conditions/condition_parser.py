@@ -28,6 +28,7 @@ from fleet.conditions.expression import (
     join_nodes,
     kind_of,
 )
+from schemas.picklable import Picklable
 from schemas.suggestion import near_names
 
 MAX_CONDITION_LENGTH: Final = 1000
@@ -38,7 +39,7 @@ _MAX_NAMES_LISTED: Final = 6
 """Maximum number of names that an error lists."""
 
 
-class BadExpression(ValueError):
+class BadExpression(Picklable, ValueError):
     """A condition with an error. The text says where (`column`, from 1), what is wrong and what is allowed."""
 
     def __init__(self, text: str, column: int, words: str) -> None:

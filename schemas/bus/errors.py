@@ -1,11 +1,13 @@
 """Errors of the bus. Each text says what is wrong, and most say what to do."""
 
+from schemas.picklable import Picklable
+
 
 class BusError(Exception):
     """The bus is not available, or a file of its hub cannot be used. The text says why."""
 
 
-class NoFleet(BusError):
+class NoFleet(Picklable, BusError):
     """Nothing listens at the endpoint."""
 
     def __init__(self, words: str, endpoint: str) -> None:

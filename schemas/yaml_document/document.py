@@ -19,6 +19,7 @@ from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, ValidationError
 from yamlcore import CoreLoader  # type: ignore[import-untyped]  # has no stubs
 
+from schemas.picklable import Picklable
 from schemas.suggestion import did_you_mean
 from schemas.yaml_document.fault_words import Where, describe_error, format_place, quote_value
 from schemas.yaml_document.partial import PartialTree
@@ -58,7 +59,7 @@ class Problem(Struct, frozen=True, order=True):
         )
 
 
-class BadFile(ValueError):
+class BadFile(Picklable, ValueError):
     """A file that cannot be used. The text has one line for each of the first 50 faults.
 
     Such a line is `file:line:column: error: field: what`.

@@ -29,7 +29,7 @@ ROOT: Final = Path(__file__).parents[2]
 PACKAGES: Final = tuple(f"{ROOT / name}{os.sep}" for name in ("fleet", "gateway", "schemas"))
 FORMS: Final = (
     "fleet.client.commands.CommandRequest",
-    "fleet_v1_pb2.StopCommand",
+    "schemas.gen.fleet_v1_pb2.StopCommand",
     "builtins.Query",  # Zenoh's
     "gateway.bus.car_service.Request",
     "gateway.control.commands.Command",
@@ -37,7 +37,7 @@ FORMS: Final = (
     "gateway.drivers.yahboom.stops.stop_in_progress.StopInProgress",
     "gateway.control.control_output.OutgoingFrame",
     "gateway.control.control_output.CommandRecord",
-    "fleet_v1_pb2.CommandEvent",
+    "schemas.gen.fleet_v1_pb2.CommandEvent",
     "fleet.client.outcome.Progress",
     "fleet.client.outcome.Outcome",
 )
@@ -46,7 +46,10 @@ REPORT_FORMS: Final = (
     "builtins.bytes",
     "gateway.drivers.yahboom.protocol.sensors.Sensors",
     "gateway.drivers.yahboom.stops.evidence.Finding",
-    *(f"fleet_v1_pb2.{name}" for name in ("Battery", "Grayscale", "Light", "Line", "Obstacle", "Range", "RxFrame")),
+    *(
+        f"schemas.gen.fleet_v1_pb2.{name}"
+        for name in ("Battery", "Grayscale", "Light", "Line", "Obstacle", "Range", "RxFrame")
+    ),
 )
 """The classes that are a report of mode 0, or what is learned of it."""
 READING_ROOTS: Final = frozenset(("LinkLoop._read", "TcpLink.data_received"))

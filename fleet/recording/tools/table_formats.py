@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Any, ClassVar, Final, Literal, Protocol
 
 from fleet.recording.tools.tables import Column, ColumnKind, Values
+from schemas.picklable import Picklable
 from schemas.suggestion import how_to_install
 
 MAX_ARROW_NS: Final = 2**63 - 1
@@ -26,7 +27,7 @@ TimeUnit = Literal["us", "ns"]
 """Unit of the times of a table."""
 
 
-class FormatMissing(ImportError):
+class FormatMissing(Picklable, ImportError):
     """A package of the extra `analysis` is not installed. The message says how to install it."""
 
     def __init__(self, package: str) -> None:
