@@ -103,6 +103,11 @@ has_systemd() {
     [ -z "$prefix" ] && [ -d /run/systemd/system ]
 }
 
+# A container may have systemd, but no udev.
+has_udev() {
+    [ -e /run/udev/control ]
+}
+
 sum() {
     sha256sum "$1" | cut -d ' ' -f 1
 }
@@ -168,7 +173,7 @@ remove() {
     rm -f -- "$copy"
     if has_systemd; then
         systemctl daemon-reload
-        udevadm control --reload
+        ! has_udev || udevadm control --reload
     fi
     echo "Removed."
 }
@@ -260,8 +265,10 @@ fi
 
 if has_systemd; then
     systemctl daemon-reload
-    udevadm control --reload
-    udevadm trigger --subsystem-match=tty
+    if has_udev; then
+        udevadm control --reload
+        udevadm trigger --subsystem-match=tty
+    fi
     # What runs has the earlier programs. A gateway stops its car before it ends.
     systemctl try-restart --no-block 'car-*.service'
     [ -z "$car" ] || systemctl start --no-block "car-gateway@$car.service"
