@@ -157,6 +157,8 @@ class CarGateway:
             notifier=self._notifier,
         )
         self._hub_lost = asyncio.Event()
+        self._no_hub = ""
+        """Why the last try to reach the hub failed, since the link to it was lost. Empty while there is one."""
         self._values_due, self._histories_due = asyncio.Event(), asyncio.Event()
         self._ending = False
         self._began_at = self._alive_at = now
@@ -348,6 +350,7 @@ class CarGateway:
                 )
                 self.stop()
             if self._bus.connected:
+                self._no_hub = ""
                 self._publisher.on_bus_connected(now)
             else:
                 self._publisher.on_bus_lost(now)
@@ -420,7 +423,9 @@ class CarGateway:
             try:
                 await asyncio.to_thread(bus.ensure_hub, self._bus.endpoint)
             except bus.BusError as error:
-                self._commands.log(Level.ERROR, "no_hub", str(error))
+                if str(error) != self._no_hub:  # the hub may be away for a weekend
+                    self._no_hub = str(error)
+                    self._commands.log(Level.ERROR, "no_hub", self._no_hub)
 
 
 def begin_logging() -> None:

@@ -142,6 +142,15 @@ def accepts(endpoint: str) -> bool:
         return False
 
 
+def unreachable(endpoint: str) -> HubUnreachable:
+    """Return the error of a hub on another computer that does not answer. A hub is started only on loopback."""
+    return HubUnreachable(
+        f"Nothing answers at {endpoint}. Is that computer on and in reach, and does its hub run? Give another address "
+        "with --connect.",
+        endpoint,
+    )
+
+
 def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     """Start a hub if nothing accepts connections at a loopback endpoint, and wait until it listens. Raises BusError.
 
@@ -153,11 +162,7 @@ def ensure_hub(endpoint: str, timeout_s: float = 30.0) -> None:
     if accepts(endpoint):
         return
     if not is_loopback(endpoint):
-        raise HubUnreachable(
-            f"Nothing listens at {endpoint}, and a hub is started automatically only on loopback. Start a Zenoh router "
-            "there (or `fleet up --insecure-lan`), or give another address with --connect.",
-            endpoint,
-        )
+        raise unreachable(endpoint)
     from schemas.process.children import leave, start_detached, wait
 
     hub = start_detached([sys.executable, "-m", "schemas.bus.hub", "--endpoint", endpoint])

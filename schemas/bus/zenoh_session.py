@@ -26,8 +26,9 @@ from schemas.bus.endpoint import (
     is_loopback,
     is_secure,
     resolve_endpoint,
+    unreachable,
 )
-from schemas.bus.errors import BusError, HubUnreachable, NoFleet
+from schemas.bus.errors import BusError, NoFleet
 from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
@@ -128,11 +129,7 @@ class Bus:
             ensure_hub(where)
         elif not accepts(where):
             if not is_loopback(where):
-                raise HubUnreachable(
-                    f"Nothing answers at {where}. Is that computer on and in reach, and does its hub run? Give another "
-                    "address with --connect.",
-                    where,
-                )
+                raise unreachable(where)
             raise NoFleet(
                 "Nothing is running yet. Start your cars with `fleet up`, or simulated ones with `fleet up --sim 3`. "
                 f"(Tried {where}; give another address with --connect.)",

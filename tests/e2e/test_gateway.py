@@ -596,7 +596,7 @@ def only_a_hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FleetProces
         (["--link", "ttyUSB0"], 2, "not a link"),
         (["--connect", "127.0.0.1:7447"], 2, "write it as tcp/HOST:PORT"),
         (["--connect", "tcp/127.0.0.1:0"], 2, "port 1 to 65535"),
-        (["--connect", "tcp/192.0.2.1:7447"], 1, "Nothing listens at tcp/192.0.2.1:7447"),
+        (["--connect", "tcp/192.0.2.1:7447"], 1, "Nothing answers at tcp/192.0.2.1:7447"),
         (["--link", "/dev/ttyNOWHERE"], 1, "serial:///dev/ttyNOWHERE: no such port"),
         (["--link", "/dev"], 1, "serial:///dev: … directory, … serial port"),
         (["--link", "tcp://127.0.0.1:1"], 1, "nothing listens"),

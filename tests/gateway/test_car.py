@@ -1,8 +1,11 @@
 """Tests of a whole gateway in the test's own process, with a real bus and a TCP car. The test can stall its loop."""
 
 import asyncio
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
+from contextlib import AsyncExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -85,3 +88,47 @@ async def test_readings_with_detected_head_are_read(fleet: FleetProcesses, car: 
         await asyncio.to_thread(wait_for, lambda: b"$BALA,MODE00#" in car.received, "a stop with its own head")
         await asyncio.to_thread(wait_for, lambda: ranges, "a reading")
         await asyncio.to_thread(wait_for, lambda: fleet.state("health").platform == "arduino+head=BALA", "its platform")
+
+
+async def test_lost_hub_of_another_computer_is_logged_once(
+    car: TcpCar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The hub may be away for a weekend, and the gateway tries every second or three."""
+    endpoint = free_endpoint().replace("127.0.0.1", "0.0.0.0")  # no loopback address by its name
+    tries: list[str] = []
+
+    def count(where: str) -> None:
+        tries.append(where)
+        ensure_hub(where)
+
+    ensure_hub = bus.ensure_hub
+    monkeypatch.setattr(bus, "ensure_hub", count)
+
+    @contextmanager
+    def running_hub() -> Iterator[None]:
+        command = [sys.executable, "-m", "schemas.bus.hub", "--endpoint", endpoint, "--insecure-lan"]
+        hub = subprocess.Popen(command)
+        try:
+            wait_for(lambda: bus.accepts(endpoint), "the hub listens")
+            yield
+        finally:
+            hub.kill()
+            hub.wait()
+
+    async def until_tried(times: int) -> None:
+        await asyncio.to_thread(wait_for, lambda: len(tries) >= times, "the gateway has tried to reach the hub")
+
+    def logged() -> int:
+        return sum("[no_hub]" in record.getMessage() for record in caplog.records)
+
+    async with AsyncExitStack() as stack:
+        with running_hub():
+            fleet = FleetProcesses(endpoint, tmp_path)
+            stack.callback(fleet.close)
+            gateway, _ = await stack.enter_async_context(served(fleet, car.link, tmp_path))
+        await until_tried(4)
+        assert logged() == 1
+        with running_hub():
+            await asyncio.to_thread(wait_for, lambda: not gateway._no_hub, "the gateway is back")
+        await until_tried(len(tries) + 3)
+        assert logged() == 2
