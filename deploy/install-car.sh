@@ -163,7 +163,11 @@ remove() {
                     rm -f -- "$what"
                 fi
                 ;;
-            u) userdel "$what" ;;
+            u)
+                # The next new user gets the same number, and must not own what stays.
+                [ ! -d "$state" ] || chown -R root:root "$state"
+                userdel "$what"
+                ;;
         esac
     done <"$copy"
     # The deepest directories first. One that holds anything stays.
@@ -243,7 +247,7 @@ if [ -z "$prefix" ]; then
 fi
 directory "$state"
 chmod 0700 "$state"
-[ -n "$prefix" ] || chown "$user:$user" "$state"
+[ -n "$prefix" ] || chown -R "$user:$user" "$state" # after an --uninstall, the number of the user may be another one
 
 put "$rules" 0644 <"$here/70-fleet-cars.rules"
 put "$units/car-gateway@.service" 0644 <"$here/car-gateway@.service"
@@ -285,4 +289,7 @@ if [ -n "$all" ]; then
     echo "For the hub's computer:"
     echo "  sudo systemctl enable --now car-hub-certificates.service car-hub-certificates.timer car-hub.service"
     echo "  sudo systemctl enable --now car-recorder.service car-console.service car-exporter.service"
+    echo "Then let others join, and pair a device with the page:"
+    echo "  sudo -u $user env -C $state FLEET_STATE_DIR=$state $opt/bin/fleet hub invite NAME"
+    echo "  sudo -u $user env -C $state FLEET_STATE_DIR=$state $opt/bin/fleet console pair NAME"
 fi
