@@ -142,6 +142,10 @@ class CommandQueue(Struct):
         for pending in [each for each in self.one_shots if each.lasts]:
             self._end_part(pending, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
 
+    def reject_part(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
+        """End an action that must not be carried out any more."""
+        self._end_part(pending, Phase.REJECTED, reason, words, now)
+
     def _end_part(self, pending: Pending, phase: Phase, reason: Reason, words: str, now: float) -> None:
         self._remove(pending)
         self.log.record(pending, phase, now, reason=reason, words=words)

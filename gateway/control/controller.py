@@ -136,7 +136,13 @@ class Controller(Generic[D_co]):
     def wait_s(self, what: Action, now: float) -> float:
         """Return how long a drive or a mode waits at most before its frame is written, s, as far as that is known."""
         busy_s = self._busy_s(now)
-        return self.driver.mode_wait_s(busy_s, now) if isinstance(what, SetMode) else busy_s
+        match what:
+            case SetMode():
+                return self.driver.mode_wait_s(busy_s, now)
+            case Drive():
+                return self.driver.drive_wait_s(busy_s, now)
+            case _:
+                return busy_s
 
     def tick(self, now: float) -> None:
         """Check for silence and for the end of a loan. It is called several times a second."""
@@ -412,7 +418,7 @@ class Controller(Generic[D_co]):
         sender, before = command.sender, self.safety.lease_at(now)
         match command.what:
             case Drive(duration_s=duration_s):
-                lasts_s = self._busy_s(now) + duration_s
+                lasts_s = self.wait_s(command.what, now) + duration_s
             case SetMode(mode):  # the lease lasts until the mode is open
                 opening_s = 0.0 if mode is Mode.MANUAL else self.driver.opening_s(mode)
                 lasts_s = self._busy_s(now) + opening_s
@@ -467,7 +473,7 @@ class Controller(Generic[D_co]):
         """
         if pending.command.streamed:
             return now + duration_s, 0.0
-        wait_s = max(self._busy_s(now), duration_s) + START_MARGIN_S
+        wait_s = max(self.wait_s(pending.command.what, now), duration_s) + START_MARGIN_S
         return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
 
     def _wait(self, pending: Pending, now: float) -> str:

@@ -414,6 +414,11 @@ class Driver(ABC):
         del now
         return ""
 
+    def drive_wait_s(self, busy_s: float, now: float) -> float:
+        """Return the longest wait, in s, of a drive until its frame is written. `busy_s` is the wait for the car."""
+        del now
+        return busy_s
+
     def mode_wait_s(self, busy_s: float, now: float) -> float:
         """Return the longest wait, in s, of a mode until its frame is written. `busy_s` is the same for a motion."""
         del now

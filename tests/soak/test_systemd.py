@@ -21,7 +21,7 @@ from tests.support.processes import FleetProcesses, driving, wait_for
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1200)]
 
 ROOT = Path(__file__).parents[2]
-DEBIAN = ROOT / ".cache/debian"
+IMAGE = ROOT / ".cache/debian"
 PACKAGES = "systemd,systemd-sysv,dbus,udev,libpam-systemd,procps,python3,python3-venv,ca-certificates"
 CERTIFICATES = "/etc/ssl/certs"
 BOOT_S = 60.0
@@ -34,7 +34,7 @@ HUB_UNITS = ("car-hub-certificates.service", "car-hub.service", "car-recorder.se
 
 
 @dataclass
-class Computer:
+class Debian:
     """A booted Debian, which shares the network of this machine."""
 
     systemd: int
@@ -64,16 +64,16 @@ def debian() -> Path:
     for needed in ("debootstrap", "systemd-nspawn"):
         assert shutil.which(needed), "this soak needs debootstrap and systemd-container, of Debian"
     assert os.geteuid() == 0, "this soak needs root"
-    if not (DEBIAN / "usr/lib/systemd/systemd").exists():
-        new = DEBIAN.with_name("debian.new")
+    if not (IMAGE / "usr/lib/systemd/systemd").exists():
+        new = IMAGE.with_name("debian.new")
         shutil.rmtree(new, ignore_errors=True)
         subprocess.run(["debootstrap", "--variant=minbase", f"--include={PACKAGES}", "bookworm", str(new)], check=True)
-        new.rename(DEBIAN)
-    return DEBIAN
+        new.rename(IMAGE)
+    return IMAGE
 
 
 @pytest.fixture
-def computer(debian: Path, tmp_path: Path) -> Iterator[Computer]:
+def computer(debian: Path, tmp_path: Path) -> Iterator[Debian]:
     """Boot it. What it writes is in memory, and gone with it."""
     binds = [f"--bind-ro={ROOT}:/clone", f"--bind-ro={CERTIFICATES}", f"--bind={tmp_path}"]
     command = [
@@ -95,7 +95,7 @@ def computer(debian: Path, tmp_path: Path) -> Iterator[Computer]:
         )
     try:
         (first,) = wait_for(lambda: psutil.Process(container.pid).children(), "systemd starts", BOOT_S)
-        made = Computer(first.pid)
+        made = Debian(first.pid)
         booted = ("running", "degraded")  # the second one if a unit of Debian's own cannot run in a container
         wait_for(lambda: made.run("systemctl", "is-system-running", ok=False) in booted, "it has booted", BOOT_S)
         yield made
@@ -111,7 +111,7 @@ def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
     fleet.close()
 
 
-def test_gateway_is_started_again_and_stops_its_car(computer: Computer, fleet: FleetProcesses) -> None:
+def test_gateway_is_started_again_and_stops_its_car(computer: Debian, fleet: FleetProcesses) -> None:
     sim, (link,) = fleet.simulate("red:arduino:tcp")
     unit = "car-gateway@red.service"
     said = computer.install("--clone", "--car", "red", "--link", link, "--platform", "arduino")
@@ -154,7 +154,7 @@ def test_gateway_is_started_again_and_stops_its_car(computer: Computer, fleet: F
     assert "red.env was changed: it stays" in computer.install("--uninstall")
 
 
-def test_hub_runs_and_uninstall_leaves_its_key_to_root(computer: Computer) -> None:
+def test_hub_runs_and_uninstall_leaves_its_key_to_root(computer: Debian) -> None:
     computer.install("--clone", "--all")
     computer.run("systemctl", "start", "car-hub-certificates.service")
     key = computer.run("find", str(STATE), "-name", "ca.key")

@@ -28,7 +28,7 @@ from gateway.control.driver import Desk, Event, Fields
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.car_monitor import CarMonitor
 from gateway.drivers.yahboom.estimate.learned import Learned
-from gateway.drivers.yahboom.estimate.outputs import joined, kept_speeds, share_of, stepped
+from gateway.drivers.yahboom.estimate.outputs import joined, kept_speeds, stepped
 from gateway.drivers.yahboom.executor import Executor
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
@@ -158,7 +158,7 @@ class YahboomDriver(Executor):
                         f"Name it: `platform:` in the fleet file, or `gateway run --platform`."
                     )
                 return f"{car} ({profile.name}) has no mode {mode}. It has: {', '.join(sorted(profile.modes))}."
-            case ChangeSpeed(step) if (words := self._too_fast(step)) is not None:
+            case ChangeSpeed(step) if (words := self._step_too_fast(step)) is not None:
                 return words
             case Find():
                 return None
@@ -174,37 +174,35 @@ class YahboomDriver(Executor):
             case Drive(Motion.STOP):
                 return None
             case Drive(motion):
-                return profile.refusal(General(motion)) or self._already_too_fast()
+                return profile.refusal(General(motion)) or self._always_too_fast()
             case _:
                 return None
 
-    def _too_fast(self, step: SpeedStep) -> str | None:
+    def _step_too_fast(self, step: SpeedStep) -> str | None:
         """Return why this step would make the car too fast, or None if it would not."""
-        car, kind, speeds = self.desk.car, self.model.profile.kind, self.model.believed.speeds
+        speeds = self.model.believed.speeds
         for each in self.queue.one_shots:
             if isinstance(each.command.what, ChangeSpeed):  # it waits, and may be written before this one, or expire
                 speeds = joined(speeds, stepped(speeds, each.command.what.step))
-        share, maximum = share_of(stepped(speeds, step), kind), self.desk.speed_max
-        if share <= max(maximum, share_of(speeds, kind)):
-            return None
-        return f"{car} would drive at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
+        return self.too_fast(step, speeds)
 
-    def _already_too_fast(self) -> str | None:
-        """Return why the car may not be driven at its present speed, or None. Cars begin at a speed of their own."""
+    def _always_too_fast(self) -> str | None:
+        """Return why the car cannot drive as slowly as it must, or None if it can, perhaps after some steps."""
         believed, maximum, car = self.model.believed, self.desk.speed_max, self.desk.car
-        share = believed.share
-        if share <= maximum:
+        if believed.steps_to(maximum) is not None:
             return None
-        slowest = believed.slowest_share
-        advice = f"`fleet speed {car} down` lowers it." if slowest <= maximum else f"Its slowest is {slowest:.0%}."
-        drives = f"drives at about {share:.0%} of full speed"
+        words = f"{car} is never as slow as {maximum:.0%} of full speed (speed_max)"
         if self.model.profile.kind is Platform.UNKNOWN:
-            drives = f"may drive at up to {share:.0%} of full speed, because its platform is not known"
-            advice = f"Name it (`platform:` in the fleet file), or wait until it is detected. {advice}"
-        elif believed.speed_is_bound:
-            cause = "because a mode or a restart of the car may have changed its speed"
-            drives = f"may drive at up to {share:.0%} of full speed, {cause}"
-        return f"{car} {drives}. Its maximum is {maximum:.0%} (speed_max). {advice}"
+            words += ", as far as is known without its platform. Name it (`platform:` in the fleet file)"
+        return f"{words}."
+
+    def wait_words(self, now: float) -> str:
+        """Return what a drive waits for, apart from stops and other commands. Empty if for nothing."""
+        del now
+        if not (steps := len(self.steps_before_drive)):
+            return ""
+        what = "a step" if steps == 1 else f"{steps} steps"
+        return f"{what} of its speed, because the maximum is {self.desk.speed_max:.0%} (speed_max)"
 
     def frames(self, what: Action) -> tuple[Frame | Later, ...]:
         """Return the frames of an action on a part of the car. Leave out those that the car does not understand."""

@@ -9,12 +9,13 @@ from typing import Final
 
 from gateway.control.command_queue import HeldMotion
 from gateway.control.command_records import Pending
-from gateway.control.commands import Fan, SetMode
+from gateway.control.commands import ChangeSpeed, Fan, SetMode
 from gateway.control.control_output import OutgoingFrame
 from gateway.control.driver import TICK_S, Desk, Driver
 from gateway.control.trust import TrustEvent
 from gateway.drivers.yahboom.car_model import CarModel
 from gateway.drivers.yahboom.estimate.learned import blocking_kind
+from gateway.drivers.yahboom.estimate.outputs import Speeds, share_of, stepped
 from gateway.drivers.yahboom.pacing import AWAKE_WAIT_S, FLIGHT_S, Gate
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import StopStyle
@@ -23,7 +24,7 @@ from gateway.drivers.yahboom.stop_executor import StopExecutor
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.sequences import SOFT, STOP_FRAME, StopSequence
 from gateway.drivers.yahboom.stops.stop_in_progress import StopInProgress
-from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, Verdict
+from schemas.words import FrameOrigin, Mode, Motion, Phase, Platform, Reason, SpeedStep, Verdict
 
 FREE_ACTIONS: Final = 3
 """Number of actions on parts of the car that are written at once. In a stream of more, the next ones may have to
@@ -50,6 +51,10 @@ class Executor(Driver):
         """The stop, motion or command of the frame that `poll` last returned. None for a repetition."""
         self._action_times: deque[float] = deque(maxlen=FREE_ACTIONS)
         """When the frames of the last actions on parts of the car were written."""
+        self._speeds_before_step: Speeds | None = None
+        """The speeds before the last frame, if that was a step of the speed."""
+        self._lowered: Pending | None = None
+        """The last drive before which the speed was lowered."""
 
     @property
     def model(self) -> CarModel:
@@ -138,12 +143,15 @@ class Executor(Driver):
             return None
         held = queue.held
         if held is not None and not held.pending.sent and self._may_overtake(held.pending):
-            self.stops.give_way(now)
-            return self._prepare(General(held.motion), FrameOrigin.COMMAND, held, held.pending)
+            return self._next_of_drive(held, now)
         if (change := self._next_mode) is not None:
             return self._open_mode(change, now)
         pending = None if self._actions_wait(now) else queue.next_part(now)
         if pending is not None and now >= self._act_at(pending) and self._may_overtake(pending):
+            what = pending.command.what  # a drive may have lowered the speed since a step was accepted
+            if isinstance(what, ChangeSpeed) and (words := self.too_fast(what.step, model.believed.speeds)):
+                queue.reject_part(pending, Reason.UNSUPPORTED, words, now)
+                return None
             frame = model.believed.with_motion(pending.next_frame)
             return self._prepare(frame, FrameOrigin.COMMAND, pending, pending)
         if self.stops.running is not None:
@@ -153,6 +161,49 @@ class Executor(Driver):
                 General(model.believed.motion), FrameOrigin.REPEAT, None, held.pending if held else None
             )
         return self._renew_stop(now)
+
+    def too_fast(self, step: SpeedStep, speeds: Speeds) -> str | None:
+        """Return why this step would make a car with one of these speeds too fast, or None if it would not."""
+        car, kind, maximum = self.desk.car, self.model.profile.kind, self.desk.speed_max
+        share = share_of(stepped(speeds, step), kind)
+        if share <= max(maximum, share_of(speeds, kind)):
+            return None
+        return f"{car} would drive at about {share:.0%} of full speed. Its maximum is {maximum:.0%} (speed_max)."
+
+    def _next_of_drive(self, held: HeldMotion, now: float) -> OutgoingFrame | None:
+        """Return the next step of the speed that the drive needs, or the motion, if that may be written now."""
+        if now < self._drive_at:
+            return None
+        frame = General(held.motion)
+        if self._is_too_fast:
+            steps = self.steps_before_drive
+            if not steps:  # the platform was detected since the drive was accepted
+                self.release(Phase.REJECTED, Reason.UNSUPPORTED, self.refusal(held.pending.command.what) or "", now)
+                return None
+            frame = General(Motion.STOP, speed=steps[0])
+        self.stops.give_way(now)
+        return self._prepare(frame, FrameOrigin.COMMAND, held, held.pending)
+
+    @property
+    def _is_too_fast(self) -> bool:
+        """Return True if the car may be faster than it is allowed to drive. So steps of the speed go before a drive."""
+        return self.model.believed.share > self.desk.speed_max
+
+    @property
+    def _drive_at(self) -> float:
+        """Return the earliest time for the next frame of the waiting drive.
+
+        A step of the speed, and the frame after it, wait until the car has read the frame before it. Of two frames in
+        its buffer, the car may ignore one, and a lost step would let it drive too fast.
+        """
+        alone = self._is_too_fast or self._speeds_before_step is not None
+        return max(self.model.ready_at, self.model.pacing.buffer_until) if alone else self.model.ready_at
+
+    def _drive_waits(self, now: float) -> bool:
+        """Return True if a drive waits until the car has read a step of its speed. No other command goes before it."""
+        held = self.queue.held
+        waits = held is not None and not held.pending.sent and self._may_overtake(held.pending)
+        return waits and now < self._drive_at
 
     def _act_at(self, pending: Pending) -> float:
         """Return the earliest time for the next frame of an action on a part of the car."""
@@ -184,6 +235,17 @@ class Executor(Driver):
             return None
         self.stops.give_way(now)
         return self._prepare(ModeOpen(pending.command.what.mode), FrameOrigin.COMMAND, pending, pending)
+
+    @property
+    def steps_before_drive(self) -> list[SpeedStep]:
+        """Return the steps of the speed that must go before a drive. Empty also if none make the car slow enough."""
+        return self.model.believed.steps_to(self.desk.speed_max) or []
+
+    def drive_wait_s(self, busy_s: float, now: float) -> float:
+        """Return the longest wait, in s, of a drive until its frame is written."""
+        del now
+        steps = len(self.steps_before_drive)
+        return busy_s + (steps + 1) * REPEAT_INTERVAL_S if steps else busy_s
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
         """Return the longest wait, in s, of a mode until its frame is written. `busy_s` is the same for a motion."""
@@ -324,14 +386,20 @@ class Executor(Driver):
                 deaf_until = max(now, model.pacing.block_until) + model.for_stop(now).turn_s
                 model.mode_closed_at, model.mode_left_by = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
             model.evidence.on_mode_00(now, awake=model.is_awake(now))
+        may_be_unread, speeds = now < model.pacing.buffer_until, model.believed.speeds
         model.pacing.on_written(frame, now)
         self._update_model(frame, now)
+        self._allow_for_lost_step(frame, speeds, may_be_unread=may_be_unread)
         match source:
             case StopInProgress():
                 self._step_written(source, now)
+            case HeldMotion() if isinstance(frame, General) and frame.speed is not None:
+                self._lowered = source.pending
             case HeldMotion():
                 source.begin(now, model.range_cm)
-                self._log.record_sent(source.pending, now)
+                lowered = self._lowered is source.pending
+                words = f"its speed was lowered to {model.believed.share:.0%} first (speed_max)" if lowered else ""
+                self._log.record_sent(source.pending, now, words)
             case Pending() if source is self.queue.mode_change:
                 self.queue.mode_change = None
                 self.mode_sent = (source, now)
@@ -344,6 +412,17 @@ class Executor(Driver):
                 self.queue.on_part_written(source, now)
             case None:
                 model.believed.repeat = False
+
+    def _allow_for_lost_step(self, frame: Frame, speeds: Speeds, *, may_be_unread: bool) -> None:
+        """Allow for a car that has ignored a step of the speed, because it read two frames at once.
+
+        `may_be_unread` is about the frame before this one, and `speeds` are those before this one.
+        """
+        is_step = isinstance(frame, General) and frame.speed is not None
+        before = speeds if is_step else self._speeds_before_step
+        if may_be_unread and before is not None:
+            self.model.believed.allow(before)
+        self._speeds_before_step = speeds if is_step else None
 
     def _step_written(self, running: StopInProgress, now: float) -> None:
         if running.on_step_written(now):
@@ -476,6 +555,8 @@ class Executor(Driver):
         model, queue, running = self.model, self.queue, self.stops.running
         if running is not None and self.stops.shutting_down:
             return []
+        if self._drive_waits(now):
+            return [self._drive_at]
         times = self._waiting_times(now) if queue.has_commands else []
         if running is None and self._repeats(max(now, model.pacing.repeat_at)):
             times.append(max(model.pacing.repeat_at, model.mode_left_by))
@@ -496,7 +577,7 @@ class Executor(Driver):
                 if self._may_overtake(each)
             )
         if queue.held is not None and not queue.held.pending.sent and self._may_overtake(queue.held.pending):
-            times.append(max(model.ready_at, free_at))
+            times.append(max(self._drive_at, free_at))
         change = self._next_mode if actions_wait else queue.mode_change
         if change is not None and self._may_overtake(change):
             opens = model.rest_is_sure or self._full_stop_runs

@@ -894,7 +894,7 @@ def test_believed_fan_and_speed_match_simulated_car() -> None:
         assert pair.car.truth.fan is pair.control.driver.model.believed.fan
     for step in (SpeedStep.DOWN, SpeedStep.DOWN, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP, SpeedStep.UP):
         pair.ask(ChangeSpeed(step))
-        pair.run(0.5)
+        pair.run(1.2)  # the car has read the step before the next frame
         assert pair.car.truth.speed == max(pair.control.driver.model.believed.speeds[Platform.ARDUINO])
 
 

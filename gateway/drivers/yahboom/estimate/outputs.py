@@ -50,14 +50,13 @@ class StateEstimate:
         """Return the highest speed that the car may have, as a share of full speed."""
         return share_of(self.speeds, self.profile.kind)
 
-    @property
-    def speed_is_bound(self) -> bool:
-        """Return True if the car of a known platform may be slower than `share`."""
-        return len(self.speeds.get(self.profile.kind, ())) > 1
-
     def allow_restart(self) -> None:
         """Allow for a car that was switched off and on, and has the speed of its start now."""
         self.speeds = {kind: speeds | {SPEEDS[kind].start} for kind, speeds in self.speeds.items()}
+
+    def allow(self, speeds: Speeds) -> None:
+        """Allow for a car that has one of these speeds."""
+        self.speeds = joined(self.speeds, speeds)
 
     def on_written(self, frame: Frame, now: float) -> None:
         """Apply a written frame."""
@@ -86,13 +85,28 @@ class StateEstimate:
             case _:
                 pass
 
-    @property
-    def slowest_share(self) -> float:
-        """Return the lowest value that steps down give `share`."""
-        speeds, seen = self.speeds, [self.speeds]
-        while (speeds := stepped(speeds, SpeedStep.DOWN)) not in seen:
+    def steps_to(self, share: float) -> list[SpeedStep] | None:
+        """Return the steps after which the car drives with at most this share of full speed, or None if none do so.
+
+        Mostly these are steps down. But if the car may have one of several speeds, steps down may never make all of
+        them slow enough, because a step below the slowest speed makes some cars faster. At the top they become one.
+        """
+        speeds, to_top = self.speeds, 0
+        while (down := self._steps_down(speeds, share)) is None:
+            faster = stepped(speeds, SpeedStep.UP)
+            if faster == speeds:
+                return None
+            speeds, to_top = faster, to_top + 1
+        return [SpeedStep.UP] * to_top + [SpeedStep.DOWN] * down
+
+    def _steps_down(self, speeds: Speeds, share: float) -> int | None:
+        seen: list[Speeds] = []
+        while share_of(speeds, self.profile.kind) > share:
+            if speeds in seen:
+                return None
             seen.append(speeds)
-        return min(share_of(each, self.profile.kind) for each in seen)
+            speeds = stepped(speeds, SpeedStep.DOWN)
+        return len(seen)
 
     @property
     def fan_may_run(self) -> bool:

@@ -1,17 +1,22 @@
 """`speed_max` by the true speed of the car, when steps wait, gateways change, and cars are switched off and on."""
 
 import json
+import random
+from itertools import pairwise
 
 import pytest
 
-from gateway.control.commands import ChangeSpeed, Drive, SetMode, Stop
+from gateway.control.commands import ChangeSpeed, Drive, Resume, SetMode, Stop
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
+from gateway.sim.model.world import World
 from schemas.words import Mode, Motion, Phase, SpeedStep
 from tests.support.controls import control
 from tests.support.virtual import Pair
 
 FULL_PWM = 255
+ROUNDING = 0.5 / FULL_PWM
+"""Error of the simulated motors, whose power is a whole number."""
 
 
 def _limited(platform: str, speed_max: float, *, auto: bool = False) -> Pair:
@@ -31,19 +36,113 @@ def _follow_with_another_gateway(pair: Pair, platform: str, speed_max: float) ->
     pair.run(12.0)
 
 
-def _drive_as_fast_as_allowed(pair: Pair) -> float:
-    """Lower the speed until a drive is accepted. Return the true share of full speed in this drive."""
-    for _ in range(10):
-        began = pair.now
-        if pair.ask(Drive(Motion.FORWARD, 2.0)).status is not Phase.REJECTED:
-            break
-        assert pair.ask(ChangeSpeed(SpeedStep.DOWN)).status is not Phase.REJECTED
-        pair.run(1.0)
-    pair.run(1.5)
-    at, left, _ = pair.car.motor_log[-1]
-    assert at >= began
-    assert left
-    return left / FULL_PWM
+def _share(pair: Pair, since: float) -> float:
+    """Return the highest true share of full speed since a time."""
+    changes = [*pair.car.motor_log, (pair.now, 0, 0)]
+    spans = [(max(abs(left), abs(right)), until) for (_, left, right), (until, *_) in pairwise(changes)]
+    return max((speed / FULL_PWM for speed, until in spans if until > since), default=0.0)
+
+
+def _driven(pair: Pair) -> float:
+    """Drive. Return the true share of full speed in this drive."""
+    began = pair.now
+    assert pair.ask(Drive(Motion.FORWARD, 2.0), identity=f"at{began}").status is Phase.QUEUED
+    pair.until(lambda: _share(pair, began) > 0, 20.0)
+    pair.run(3.0)
+    assert pair.phases(f"at{began}")[-1] is Phase.SENT
+    return _share(pair, began)
+
+
+@pytest.mark.parametrize(
+    ("platform", "speed_max", "steps"),
+    [("arduino", 0.59, 0), ("arduino", 0.5, 1), ("arduino", 0.2, 2), ("stm32", 0.11, 1), ("raspberry_pi", 0.3, 3)],
+)
+def test_drive_begins_after_the_steps_down_that_it_needs(platform: str, speed_max: float, steps: int) -> None:
+    """It was refused, after each start of a car that begins faster, and after each mode that sets the speed."""
+    pair = _limited(platform, speed_max)
+    pair.run(10.0)
+    sent = len(pair.sent)
+    answer = pair.ask(Drive(Motion.FORWARD, 1.0), identity="d")
+    assert (" step" in answer.words) is (steps > 0)
+    pair.until(lambda: pair.phases("d")[-1] is Phase.SENT, steps * 1.2 + 0.2)
+    down = sum(b"0,0,0,2,0" in frame for _, frame in pair.sent[sent:])
+    assert down == steps
+    assert ("speed_max" in pair.records[-1].words) is (steps > 0)
+    pair.run(0.5)
+    assert 0.0 < _share(pair, 0.0) <= speed_max
+
+
+def test_stream_drives_after_steps_down() -> None:
+    """Each sample lasts for less than the steps take, but the next ones come."""
+    pair = _limited("arduino", 0.4)
+    pair.ask(SetMode(Mode.TRACKING))
+    pair.run(10.0)
+    pair.ask(SetMode(Mode.MANUAL))
+    pair.run(10.0)
+    began = pair.now
+    while not _share(pair, began):
+        assert pair.now < began + 10.0
+        pair.ask(Drive(Motion.FORWARD, 0.5), streamed=True)
+        pair.run(0.1)
+    assert _share(pair, began) <= 0.4
+    pair.run(3.0)
+    assert pair.car.motor_log[-1][1:] == (0, 0)
+
+
+def test_no_drive_is_begun_after_a_release_during_steps_down() -> None:
+    pair = _limited("arduino", 0.2)
+    pair.run(10.0)
+    began = pair.now
+    pair.ask(Drive(Motion.FORWARD, 2.0))
+    pair.run(0.1)
+    pair.ask(Stop())
+    pair.run(10.0)
+    assert not _share(pair, began)
+
+
+RARE = (542, 624, 981, 2120, 3485, 3803)
+"""Episodes among the first 4,000 that need more than the steps: a step up that waits, or a step of which the car knows
+nothing, because it read the next frame instead. 3607 is left out: the car was stuck when the step came, as it may be
+after each stop, and nothing shows which frames it has lost."""
+PLATFORMS = ("arduino", "stm32", "raspberry_pi")
+
+
+@pytest.mark.parametrize("seed", [*range(100), *RARE])
+def test_no_drive_is_too_fast_and_each_one_begins(seed: int) -> None:
+    """Random steps, modes, stops, lost links and restarts of the car, with and without echoes."""
+    chance = random.Random(seed)
+    platform, limit = chance.choice(PLATFORMS), chance.choice((0.25, 0.4, 0.5, 0.6, 0.8, 0.95))
+    is_open = chance.random() < 0.3
+    pair = Pair(platform, seed=seed, world=World.open_field() if is_open else None)
+    auto = platform != "stm32" and chance.random() < 0.3  # many an stm32 car is taken for an arduino car
+    pair.control = control(parse_platform("unknown" if auto else platform), speed_max=limit, auto=auto)
+    pair.ready()
+    # In some modes, a car without any echo hangs.
+    left_out = {Mode.MANUAL, *((Mode.OBSTACLE_AVOIDANCE, Mode.FOLLOWING) if is_open else ())}
+    modes = sorted(set(parse_platform(platform).modes) - left_out)
+    for _ in range(12):
+        match chance.choice(("up", "down", "mode", "stop", "lose", "drive", "drive")):
+            case "up":
+                pair.ask(ChangeSpeed(SpeedStep.UP))
+            case "down":
+                pair.ask(ChangeSpeed(SpeedStep.DOWN))
+            case "mode" if modes:
+                pair.ask(SetMode(chance.choice(modes)))
+                pair.run(chance.uniform(1.0, 20.0))
+                pair.ask(SetMode(Mode.MANUAL))
+                pair.run(8.0)
+            case "stop":
+                pair.ask(Stop())
+                pair.ask(Resume())
+            case "lose":
+                pair.lose()
+                if chance.random() < 0.5:
+                    pair.car.brown_out(pair.now)
+                pair.run(chance.uniform(2.0, 8.0), linked=False)
+                pair.ready()
+            case _:
+                assert 0 < _driven(pair) <= limit + ROUNDING
+        pair.run(chance.choice((0.0, 0.05, 0.3, 1.0, 6.0)))
 
 
 @pytest.mark.parametrize(("platform", "speed_max"), [("arduino", 0.8), ("stm32", 0.35)])
@@ -55,7 +154,7 @@ def test_steps_that_wait_do_not_add_up_beyond_limit(platform: str, speed_max: fl
     answers = [pair.ask(ChangeSpeed(SpeedStep.UP)).status for _ in range(4)]
     assert answers == [Phase.QUEUED, *[Phase.REJECTED] * 3]
     pair.run(5.0)
-    assert speed_max - 0.1 < _drive_as_fast_as_allowed(pair) <= speed_max
+    assert speed_max - 0.1 < _driven(pair) <= speed_max
 
 
 @pytest.mark.parametrize(("platform", "speed_max"), [("arduino", 0.6), ("stm32", 0.35), ("raspberry_pi", 0.85)])
@@ -66,8 +165,7 @@ def test_next_gateway_knows_speed_to_which_car_was_set(platform: str, speed_max:
         pair.ask(ChangeSpeed(SpeedStep.UP))
         pair.run(1.0)
     _follow_with_another_gateway(pair, platform, speed_max)
-    assert pair.ask(Drive(Motion.FORWARD, 1.0)).status is Phase.REJECTED
-    assert _drive_as_fast_as_allowed(pair) <= speed_max
+    assert _driven(pair) <= speed_max
 
 
 def test_next_gateway_knows_that_a_mode_has_set_speed() -> None:
@@ -76,7 +174,7 @@ def test_next_gateway_knows_that_a_mode_has_set_speed() -> None:
     pair.run(30.0)
     _follow_with_another_gateway(pair, "arduino", 0.6)
     assert pair.car.truth.speed > 0.6 * FULL_PWM
-    assert _drive_as_fast_as_allowed(pair) <= 0.6
+    assert _driven(pair) <= 0.6
 
 
 def test_platform_that_is_detected_again_keeps_speed() -> None:
@@ -91,7 +189,7 @@ def test_platform_that_is_detected_again_keeps_speed() -> None:
     pair.ready()
     pair.run(5.0)
     assert pair.car.truth.speed > 0.6 * FULL_PWM
-    assert _drive_as_fast_as_allowed(pair) <= 0.6
+    assert _driven(pair) <= 0.6
 
 
 @pytest.mark.parametrize("after_s", [0.0, 2.0, 6.0])
@@ -101,33 +199,28 @@ def test_car_whose_platform_is_not_known_yet_may_be_the_fastest(after_s: float) 
     pair.control = control(parse_platform("unknown"), auto=True, speed_max=0.6)
     pair.connect()
     pair.run(after_s)
-    refused = pair.ask(Drive(Motion.FORWARD, 3.0))
-    assert refused.status is Phase.REJECTED
-    assert "80%" in refused.words
-    pair.run(12.0)
-    assert not pair.driven_since(0.0)
-    assert _drive_as_fast_as_allowed(pair) <= 0.6
+    assert pair.ask(Drive(Motion.FORWARD, 3.0)).status is Phase.QUEUED
+    pair.run(20.0)
+    assert 0.0 < _share(pair, 0.0) <= 0.6
+    assert _driven(pair) <= 0.6
 
 
 @pytest.mark.parametrize("is_switched_off", [False, True])
 def test_car_that_was_switched_off_during_loss_of_link_begins_with_its_own_speed(*, is_switched_off: bool) -> None:
     pair = _limited("arduino", 0.4)
-    assert _drive_as_fast_as_allowed(pair) <= 0.4
+    assert _driven(pair) <= 0.4
     pair.run(5.0)
     pair.lose()
     if is_switched_off:
         pair.car.brown_out(pair.now)
     pair.run(5.0, linked=False)
     pair.ready()
-    refused = pair.ask(Drive(Motion.FORWARD, 1.0))
-    assert refused.status is Phase.REJECTED
-    assert "40%" in refused.words
-    assert _drive_as_fast_as_allowed(pair) <= 0.4
+    assert _driven(pair) <= 0.4
 
 
 def test_car_that_was_switched_off_behind_an_open_link_begins_with_its_own_speed() -> None:
     pair = _limited("arduino", 0.4)
-    assert _drive_as_fast_as_allowed(pair) <= 0.4
+    assert _driven(pair) <= 0.4
     pair.run(5.0)
     pair.deaf_until = pair.now + 20.0
     pair.lose_frames()
@@ -135,8 +228,7 @@ def test_car_that_was_switched_off_behind_an_open_link_begins_with_its_own_speed
     pair.car.brown_out(pair.now)
     pair.pass_frames()
     pair.run(15.0)
-    assert pair.ask(Drive(Motion.FORWARD, 1.0)).status is Phase.REJECTED
-    assert _drive_as_fast_as_allowed(pair) <= 0.4
+    assert _driven(pair) <= 0.4
 
 
 def test_speeds_of_a_damaged_file_are_not_used() -> None:

@@ -35,15 +35,23 @@ def test_no_step_beyond_the_speed_that_is_allowed(
     ("platform", "limit", "steps_down"),
     [("arduino", 0.59, 0), ("arduino", 0.5, 1), ("arduino", 0.2, 2), ("stm32", 0.2, 0), ("raspberry_pi", 0.3, 3)],
 )
-def test_no_drive_beyond_the_speed_that_is_allowed(platform: str, limit: float, steps_down: int) -> None:
+def test_steps_down_go_before_a_drive(platform: str, limit: float, steps_down: int) -> None:
     driver = control(parse_platform(platform), speed_max=limit).driver
-    for _ in range(steps_down):
-        words = driver.refusal(Drive(Motion.FORWARD))
-        assert words is not None
-        assert f"{limit:.0%}" in words
-        assert driver.refusal(ChangeSpeed(SpeedStep.DOWN)) is None
+    for left in range(steps_down, 0, -1):
+        assert driver.steps_before_drive == [SpeedStep.DOWN] * left
+        assert driver.refusal(Drive(Motion.FORWARD)) is None
         driver.model.believed.on_written(General(Motion.STOP, speed=SpeedStep.DOWN), 0.0)
+    assert driver.steps_before_drive == []
     assert driver.refusal(Drive(Motion.FORWARD)) is None
+
+
+@pytest.mark.parametrize(("platform", "limit"), [("arduino", 0.19), ("stm32", 0.09), ("raspberry_pi", 0.19)])
+def test_drive_that_is_always_too_fast_is_refused(platform: str, limit: float) -> None:
+    driver = control(parse_platform(platform), speed_max=limit).driver
+    words = driver.refusal(Drive(Motion.FORWARD))
+    assert words is not None
+    assert f"{limit:.0%}" in words
+    assert driver.steps_before_drive == []
 
 
 def test_stop_is_never_too_fast() -> None:
@@ -55,13 +63,8 @@ def test_stop_is_never_too_fast() -> None:
 @pytest.mark.parametrize(("limit", "steps_down"), [(1.0, 0), (0.6, 3), (0.4, 4)])
 def test_speed_that_a_mode_has_set_is_lowered_before_a_drive(limit: float, steps_down: int) -> None:
     driver = control(parse_platform("arduino"), speed_max=limit).driver
-    believed = driver.model.believed
-    believed.on_written(ModeOpen(Mode.TRACKING), 0.0)
-    for _ in range(steps_down):
-        assert driver.refusal(Drive(Motion.FORWARD)) is not None
-        assert driver.refusal(ChangeSpeed(SpeedStep.DOWN)) is None
-        believed.on_written(General(Motion.STOP, speed=SpeedStep.DOWN), 0.0)
-    assert driver.refusal(Drive(Motion.FORWARD)) is None
+    driver.model.believed.on_written(ModeOpen(Mode.TRACKING), 0.0)
+    assert driver.steps_before_drive == [SpeedStep.DOWN] * steps_down
 
 
 @pytest.mark.parametrize("platform", ["arduino", "stm32"])
