@@ -578,8 +578,8 @@ class Executor(Driver):
             )
         if queue.held is not None and not queue.held.pending.sent and self._may_overtake(queue.held.pending):
             times.append(max(self._drive_at, free_at))
-        change = self._next_mode if actions_wait else queue.mode_change
-        if change is not None and self._may_overtake(change):
+        change = self._next_mode
+        if change is not None:
             opens = model.rest_is_sure or self._full_stop_runs
             open_at = model.pacing.open_at(now, can_show=model.can_show) if opens else float("-inf")
             times.append(max(open_at, model.ready_at, free_at))

@@ -31,6 +31,7 @@ from gateway.drivers.yahboom.stop_renewal import RENEWAL_INTERVALS_S
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.stop_in_progress import RETRY_S
 from gateway.sim.model.traits import CarTraits
+from gateway.sim.model.world import World
 from schemas.commands import Verb
 from schemas.limits import MAX_QUEUE_TIME_S, SHUTDOWN_S
 from schemas.rights import Hold, Sender
@@ -987,3 +988,16 @@ def test_command_during_mode_change_is_not_lost(mode: Mode) -> None:
         pair.ask(Fan())
         pair.run(7.0)
         assert pair.car.truth.fan is not before, seed
+
+
+def test_mode_behind_a_waiting_action_keeps_no_loop_busy() -> None:
+    """Without an echo, the second action waits for the first. The mode waits for both, and is not due meanwhile."""
+    pair = Pair("arduino", world=World.open_field()).ready()
+    pair.ask(Drive(Motion.FORWARD, 0.5))
+    pair.run(6.0)
+    pair.ask(Led(1, 2, 3))
+    pair.run(0.3)
+    pair.ask(ChangeSpeed(SpeedStep.UP))
+    pair.ask(SetMode(Mode.LIGHT_SEEKING))
+    pair.run(6.0)  # fails if the loop never sleeps
+    assert pair.car.truth.mode is Mode.LIGHT_SEEKING
