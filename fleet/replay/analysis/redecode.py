@@ -1,8 +1,9 @@
 """Decodes recorded raw frames with today's decoder, and yields every difference to the recorded readings. Pure.
 
 The readings of a frame depend on the platform and the mode of the car. Both come from the recording. But a recording
-leaves two things open: which of two modes or platforms applied at the moment of a frame, and whether silence or the
-next frame ended a frame that has no # at its end. So a frame may have several possible results. It then counts as
+leaves three things open: which of two modes or platforms applied at the moment of a frame, whether silence or the next
+frame ended a frame that has no # at its end, and whether the gateway took some values for constants, because the car
+might have been an stm32. So a frame may have several possible results. It then counts as
 undecided, and it is a difference only if none of the results is the recorded one.
 """
 
@@ -20,7 +21,7 @@ from gateway.drivers.yahboom.protocol.frames import STANDARD_HEAD
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
 from gateway.drivers.yahboom.protocol.wire_events import Event
-from schemas.words import FrameVerdict, Mode
+from schemas.words import FrameVerdict, Mode, Platform
 
 MAX_MODE_DELAY_NS: Final = 500_000_000
 """Maximum delay from a mode change to its publication, because the loop of a gateway processes input in batches."""
@@ -126,8 +127,11 @@ class Redecoding(Struct):
             self._decoder.sent(sent.data, (sent.at_ns - self._began_ns) / 1e9)
         modes = [each.mode for each in _around(self._modes, frame.at_ns, MAX_MODE_DELAY_NS)] or [None]
         found: list[Outcome] = []
-        for events, profile, mode in product(_decode(self._decoder, frame.data, at), profiles, dict.fromkeys(modes)):
-            outcome = _outcome(events, profile, mode)
+        decoded = _decode(self._decoder, frame.data, at)
+        for events, profile, mode, is_open in product(decoded, profiles, dict.fromkeys(modes), (False, True)):
+            outcome = _outcome(
+                events, profile, mode, may_be_stm32=is_open and profile.kind is not Platform.RASPBERRY_PI
+            )
             if outcome not in found:
                 found.append(outcome)
         if (
@@ -186,12 +190,12 @@ def _decode(decoder: FrameSplitter, data: bytes, at: float) -> list[tuple[Event,
     return found
 
 
-def _outcome(events: Iterable[Event], profile: Profile, mode: Mode | None) -> Outcome:
+def _outcome(events: Iterable[Event], profile: Profile, mode: Mode | None, *, may_be_stm32: bool) -> Outcome:
     verdicts = []
     readings: dict[str, dict[str, Any]] = {}
     for event in events:
         verdicts.append(verdict_of(event))
-        readings |= measured(event, profile, mode)
+        readings |= measured(event, profile, mode, may_be_stm32=may_be_stm32)
     return " ".join(verdicts), readings
 
 

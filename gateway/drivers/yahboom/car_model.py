@@ -170,6 +170,16 @@ class CarModel:
         return self.profile.kind is Platform.ARDUINO and is_sure and not self.profile.fan_is_level
 
     @property
+    def may_send_constants(self) -> bool:
+        """Return True if this may be the stm32 program whose mode-0 report has constants.
+
+        The bytes of arduino and stm32 cars are usually the same, so a car that was only detected may be either. A car
+        that has shown its stops is no stm32, and one that has ever sent another grayscale than 0 has no constants.
+        """
+        is_other = self.profile.kind is Platform.RASPBERRY_PI or self.learned.shows is Shows.YES
+        return self.auto and not is_other and self.learned.extremes.get("GS", (0.0, 0.0))[1] == 0.0
+
+    @property
     def is_deaf(self) -> bool:
         """Return True if the car can show a stop, but never reacted on this link, or did not show the last one."""
         shows = self.can_show and self.stop_style is StopStyle.MODE_FRAME

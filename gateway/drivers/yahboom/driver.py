@@ -94,7 +94,10 @@ class YahboomDriver(Executor):
 
     def measured(self, event: Event) -> Mapping[str, Fields]:
         """Return the measured values of an event by topic."""
-        return measured(_as_wire_event(event), self.model.profile, self.model.mode.confirmed)
+        model = self.model
+        return measured(
+            _as_wire_event(event), model.profile, model.mode.confirmed, may_be_stm32=model.may_send_constants
+        )
 
     def verdict(self, event: Event) -> str:
         """Return the kind of an event, such as `sensors` or `echo`, or the cause for which its bytes were rejected."""

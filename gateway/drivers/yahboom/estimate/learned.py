@@ -187,10 +187,12 @@ class Learned(Struct):
         return changed and was_known
 
     def forget_reactions(self) -> None:
-        """Forget whether the car can show a stop, because it may be another car or program now."""
+        """Forget whether the car can show a stop, and its values, because it may be another car or program now."""
         self.shows, self.doubted, self._unreacted = Shows.UNKNOWN, False, 0
         self._delays.clear()
         self._blocks.clear()
+        self.extremes.clear()
+        self.rejected.clear()
 
     def interval_s(self, expected_s: float) -> float:
         """Return the interval of the reports with an echo: the observed one, or else the expected one."""

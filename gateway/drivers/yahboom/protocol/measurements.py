@@ -30,14 +30,17 @@ def verdict_of(event: Event) -> str:
             return str(cause)
 
 
-def measured(event: Event, profile: Profile, confirmed: Mode | None) -> dict[str, Fields]:
+def measured(
+    event: Event, profile: Profile, confirmed: Mode | None, *, may_be_stm32: bool = False
+) -> dict[str, Fields]:
     """Return the measured fields by topic, in the order of publication, in the units of the messages.
 
-    `confirmed` is the confirmed mode of the car, or None. Fields that were not measured are omitted.
+    `confirmed` is the confirmed mode of the car, or None. Fields that were not measured are omitted. With
+    `may_be_stm32`, the car may also run an stm32 program, some of whose fields are constants.
     """
     match event:
         case Sensors():
-            return _sensors(event, profile, confirmed)
+            return _sensors(event, profile, confirmed, may_be_stm32=may_be_stm32)
         case ArmReading(joint_deg=joints):
             degrees = tuple(joint for joint in joints if joint is not None)
             return {"sensor/arm": {"joint_deg": degrees}} if len(degrees) == len(joints) else {}
@@ -47,8 +50,8 @@ def measured(event: Event, profile: Profile, confirmed: Mode | None) -> dict[str
             return {}
 
 
-def _sensors(event: Sensors, profile: Profile, confirmed: Mode | None) -> dict[str, Fields]:
-    names = profile.measured(event, confirmed)
+def _sensors(event: Sensors, profile: Profile, confirmed: Mode | None, *, may_be_stm32: bool) -> dict[str, Fields]:
+    names = profile.measured(event, confirmed, may_be_stm32=may_be_stm32)
     topics: dict[str, Fields] = {}
     for name, attribute, topic, published in _PUBLISHED:
         if name in names:

@@ -321,17 +321,18 @@ class Profile(Struct, frozen=True, dict=True):
             return candidates
         return (mode,) if mode in candidates else (*candidates, mode)
 
-    def measured(self, event: Sensors, mode: Mode | None = None) -> frozenset[str]:
+    def measured(self, event: Sensors, mode: Mode | None = None, *, may_be_stm32: bool = False) -> frozenset[str]:
         """Return the fields of this frame that are measurements in every mode in which it may have been sent.
 
         `mode` is the confirmed mode, or None (see `modes_of_frame`). A rejected field is no measurement. A range of a
-        ranging without an echo is a measurement.
+        ranging without an echo is a measurement. With `may_be_stm32`, the constants of an stm32 program are none.
         """
         common = _common_measurements(self.modes_of_frame(event, mode), candidate_modes(event))
         names = {name for name in common if getattr(event, ATTRIBUTES[name]) is not None}
         if self.constants and self._may_be_constant(event):
             names -= {name for name, value in self.constants if getattr(event, ATTRIBUTES[name]) == value}
-        if self.kind is Platform.STM32 and candidate_modes(event) == (Mode.MANUAL,) and _stm32_constants(event):
+        is_stm32 = may_be_stm32 or self.kind is Platform.STM32
+        if is_stm32 and candidate_modes(event) == (Mode.MANUAL,) and _stm32_constants(event):
             names -= _STM32_CONSTANTS
         return frozenset(names - self._out_of_range(event))
 

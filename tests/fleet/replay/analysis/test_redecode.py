@@ -77,6 +77,23 @@ def test_every_field_of_a_vector_counts(path: Path) -> None:
     assert changed
 
 
+def test_constants_may_have_been_published_or_not() -> None:
+    """A recording does not say if the gateway took the car for an stm32 that sends constants."""
+    frame = Rx(S, b"$4WD,CSB57.00,PV7.50,GS0,LF0000,HW00,GM00#", "sensors")
+    left_out = {"sensor/range": {"no_echo": False, "range_m": 0.57}, "sensor/battery": {"voltage_v": 7.5}}
+    sides = {"left": False, "right": False}
+    more = {
+        "sensor/grayscale": {"raw": 0},
+        "sensor/line": dict.fromkeys(LINE["sensor/line"], False),
+        "sensor/obstacle": sides,
+        "sensor/light": sides,
+    }
+    for readings in (left_out, {**left_out, **more}):
+        then = replace(frame, published=tuple(readings), readings=readings)
+        found, one = redecoded([KnownPlatform(0, "arduino"), KnownMode(0, Mode.MANUAL), then])
+        assert (found, one.counts.undecided) == ([], 1)
+
+
 def test_redecode_of_verdict_and_unpublished_reading() -> None:
     known: list[Item] = [KnownPlatform(0, "arduino"), KnownMode(0, Mode.TRACKING)]
     frame = Rx(S, TRACKING, "sensors", ("sensor/line",), LINE)

@@ -3,20 +3,25 @@
 import json
 
 import pytest
+from msgspec.structs import replace
 
 from gateway.control.commands import Drive, SetMode, Stop
+from gateway.control.driver import Event
 from gateway.drivers.yahboom.estimate.learned import Learned
+from gateway.drivers.yahboom.protocol.modes import EVERY_MEASUREMENT
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.sim.model.raspberry_pi import Transport
+from gateway.sim.model.stm32 import STM32_TRAITS
+from gateway.sim.model.traits import CarTraits
 from schemas.platform_name import parse_option
-from schemas.words import Mode, Motion, Platform
+from schemas.words import Mode, Motion, Platform, Shows
 from tests.support.controls import control
 from tests.support.virtual import Pair
 
 
-def paired(platform: str) -> Pair:
+def paired(platform: str, *, traits: CarTraits | None = None) -> Pair:
     transport = Transport.TCP if platform == "raspberry_pi" else Transport.SERIAL
-    pair = Pair(platform, transport=transport)
+    pair = Pair(platform, transport=transport, traits=traits)
     name, auto = parse_option("auto")
     pair.control = control(parse_platform(name), auto=auto)
     pair.connect()
@@ -47,6 +52,43 @@ def test_auto_platform_detects_and_stops_each_car(platform: str, settled: str, f
     pair.run(4.0)
     assert first in [data for _, data in pair.sent]
     assert pair.off_for_good_at()
+
+
+def published(pair: Pair, seconds: float) -> list[set[str]]:
+    """Let time pass. Return the topics of each reading that a gateway publishes."""
+    found: list[set[str]] = []
+    driver = pair.control.driver
+    heard = driver.on_event
+
+    def publishing(event: Event, now: float) -> None:
+        found.append({topic.removeprefix("sensor/") for topic in driver.measured(event)})
+        heard(event, now)
+
+    driver.on_event = publishing  # type: ignore[method-assign]  # where link_loop.py publishes an event
+    pair.run(seconds)
+    return found
+
+
+def test_constants_of_stm32_that_counts_as_arduino_are_not_published() -> None:
+    """The car stands on its line, and its constants say that it sees none."""
+    pair = paired("stm32", traits=replace(STM32_TRAITS, constants=True))
+    assert any(pair.car._body.line(pair.now))
+    found = published(pair, 30.0)
+    assert pair.control.driver.model.profile.name == "arduino"
+    assert len(found) > 20
+    assert all(each == {"range", "battery"} for each in found)
+
+
+def test_all_fields_of_a_car_without_constants_are_published_at_once() -> None:
+    assert all(each == EVERY_MEASUREMENT for each in published(paired("stm32"), 5.0))
+
+
+def test_zeros_of_arduino_are_measurements_once_it_has_shown_a_stop() -> None:
+    """Its report may have the text of the constants because there is nothing to see."""
+    pair = paired("arduino", traits=CarTraits(constants=True))
+    found = published(pair, 30.0)
+    assert pair.control.driver.model.learned.shows is Shows.YES
+    assert (found[0], found[-1]) == ({"range", "battery"}, EVERY_MEASUREMENT)
 
 
 def test_undetected_platform_gets_only_common_frames() -> None:
