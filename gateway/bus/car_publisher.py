@@ -15,7 +15,6 @@ import zenoh
 from gateway.bus.history_buffer import BadRange, HistoryBuffer, Value
 from gateway.bus.process_stats import ProcessStats
 from gateway.clock import WallClock
-from gateway.control import battery
 from gateway.control.control_output import CommandRecord, LogRecord, OutgoingFrame
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, DriverClaims, Event
@@ -96,12 +95,12 @@ class CarPublisher:
         for name, fields in self._driver.measured(event).items():
             message = _CLASSES[name](**fields)
             if name == "sensor/battery":
-                voltage_v = message.voltage_v
                 loaded = model.motors is not Motors.OFF
-                message.charge, message.charge_error = battery.charge(
-                    voltage_v, loaded=loaded, cells=model.profile.cells
-                )
-                message.level = model.battery.level or BatteryLevel.OK
+                # The driver updates its battery only after this, and the message must agree with the log.
+                battery = model.battery.after(message.voltage_v, loaded=loaded, now=event.at)
+                if battery.charge is not None:
+                    message.charge, message.charge_error = battery.charge
+                message.level = battery.level or BatteryLevel.OK
             self._put_kept(name, message, event.at, stamp_ns)
             published.append(name)
         if not self._raw.take(1, event.at):

@@ -3,6 +3,7 @@
 A raspberry_pi car sends a constant instead of a measured voltage (see `Profile.measured`).
 """
 
+from copy import copy
 from typing import Final
 
 from msgspec import Struct, field
@@ -17,6 +18,8 @@ LOAD_RECOVERY_S: Final = 5.0
 """Maximum time for which the voltage rises after a load. An estimate, not measured."""
 CHARGE_ERROR: Final = 0.15
 """Error of the charge without a load. The estimate is linear, but the curve of a Li-ion cell is flat in the middle."""
+TWO_CELLS_V: Final = 9.0
+"""Voltage above which a battery must have more than two cells: two full cells have 8.4 V."""
 HYSTERESIS_V: Final = 0.15
 """How far the voltage must rise above a threshold to end the lower level."""
 LEVEL_DEBOUNCE_S: Final = 5.0
@@ -94,6 +97,12 @@ class Battery(Struct):
             self._is_settled = True
         return changed
 
+    def after(self, voltage_v: float, *, loaded: bool, now: float) -> "Battery":
+        """Return what `on_voltage` would make of this battery, which stays as it is."""
+        battery = copy(self)
+        battery.on_voltage(voltage_v, loaded=loaded, now=now)
+        return battery
+
     def _update_level(self, voltage_v: float, now: float) -> bool:
         low_v, high_v = rest_v(voltage_v, loaded=self.loaded)
         worse, better = self.policy.level(high_v), self.policy.level(low_v - HYSTERESIS_V)
@@ -128,6 +137,16 @@ class Battery(Struct):
         return self.measured_at - self._loaded_at < LOAD_RECOVERY_S
 
     @property
+    def charge(self) -> tuple[float, float] | None:
+        """Return the charge and its error, or None if it is not known.
+
+        It is not known without a voltage, or if the battery must have more cells than the car is known to have.
+        """
+        if self.voltage_v is None or self.voltage_v > TWO_CELLS_V * self.cells / 2:
+            return None
+        return charge(self.voltage_v, loaded=self.loaded, cells=self.cells)
+
+    @property
     def action(self) -> BatteryAction | None:
         """Return the reaction to the current level."""
         return self.policy.action(self.level)
@@ -137,8 +156,8 @@ class Battery(Struct):
         """Return a text with level, voltage and charge. Empty if no voltage was measured."""
         if self.level is None or self.voltage_v is None:
             return ""
-        share, error = charge(self.voltage_v, loaded=self.loaded, cells=self.cells)
-        return f"battery {self.level}: {self.voltage_v:.2f} V, charge {share:.0%} +- {error:.0%}"
+        share = "" if self.charge is None else ", charge {:.0%} +- {:.0%}".format(*self.charge)
+        return f"battery {self.level}: {self.voltage_v:.2f} V{share}"
 
     @property
     def refusal(self) -> str:

@@ -80,6 +80,17 @@ class Published:
         self.record(CommandRecord(Command("end", "find", SCRIPT, Find()), Phase.SENT, self.desk.now))
         return self._before
 
+    def battery(self, frame: bytes) -> dict[str, Any]:
+        """Publish the readings of a frame, and then give it to control. Return the fields of its battery."""
+        for event in FrameSplitter().feed(frame, self.desk.now):
+            self._out.publish_event(event)
+        self.desk.hear(frame)
+        return next(
+            fields
+            for topic, fields in iter(lambda: self._said.get(timeout=PATIENCE_S), None)
+            if topic == "sensor/battery"
+        )
+
     def told_health(self, platform: PlatformDetector) -> dict[str, Any]:
         """Publish the health of a car of this platform. Return its fields, as in JSON."""
         model = self.desk.control.driver.model
@@ -117,6 +128,18 @@ def test_platform_contradictions_are_published(published: Published) -> None:
     words = list(told.contradictions)
     assert words
     assert published.told_health(told)["platform_contradictions"] == words
+
+
+def test_level_of_battery_is_that_of_the_log(published: Published) -> None:
+    """In most modes a car reports no voltage, so the message with the new level may be the last one for long."""
+    desk = published.desk
+    levels: list[str] = []
+    desk.logs.clear()
+    while not any(entry.code == "battery_low" for entry in desk.logs):
+        desk.now += 1.0
+        levels.append(published.battery(b"$4WD,CSB57.24,PV6.55,GS5,LF0000,HW00,GM00#")["level"])
+        assert len(levels) < 20
+    assert levels == ["ok"] * (len(levels) - 1) + ["low"]
 
 
 def test_states_leave_out_what_does_not_apply(published: Published) -> None:

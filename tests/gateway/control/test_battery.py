@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.control.battery import LEVEL_DEBOUNCE_S, Battery, BatteryPolicy, charge
+from gateway.control.battery import LEVEL_DEBOUNCE_S, LOAD_RECOVERY_S, Battery, BatteryPolicy, charge
 from schemas.battery_levels import LOW_V
 from schemas.words import BatteryAction, BatteryLevel
 
@@ -44,6 +44,24 @@ def test_always_a_share_and_an_error(voltage_v: float, loaded: bool) -> None:
     share, error = charge(voltage_v, loaded=loaded)
     assert 0 <= share <= 1
     assert 0 < error <= 1
+
+
+@pytest.mark.parametrize(
+    ("cells", "voltage_v", "is_known"), [(2, 9.0, True), (2, 9.1, False), (3, 9.1, True), (3, 12.6, True)]
+)
+def test_no_charge_of_a_voltage_that_these_cells_cannot_have(cells: int, voltage_v: float, *, is_known: bool) -> None:
+    battery = Battery(cells=cells)
+    assert battery.charge is None, "nothing was measured"
+    battery.on_voltage(voltage_v, loaded=False, now=0.0)
+    assert (battery.charge is not None) is is_known
+    assert ("charge" in battery.words) is is_known
+
+
+def test_charge_is_less_sure_until_the_voltage_has_recovered_from_a_load() -> None:
+    battery = Battery()
+    hear(battery, 7.4, loaded=True)
+    errors = [battery.after(7.4, loaded=False, now=now).charge for now in (0.0, LOAD_RECOVERY_S - 0.1, LOAD_RECOVERY_S)]
+    assert [error[1] for error in errors if error] == [pytest.approx(each) for each in (0.25, 0.25, 0.15)]
 
 
 def hear(battery: Battery, *voltages: float, loaded: bool = False, from_s: float = 0.0) -> list[float]:

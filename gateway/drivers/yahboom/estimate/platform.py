@@ -10,6 +10,7 @@ from typing import Final
 
 from msgspec import Struct
 
+from gateway.control.battery import TWO_CELLS_V
 from gateway.control.driver import Rejected, TextLine
 from gateway.drivers.yahboom.protocol.modes import candidate_modes, only_candidate
 from gateway.drivers.yahboom.protocol.platforms import GRAY_10_BIT, Profile, parse_platform, pi_constants, whole_cm
@@ -32,8 +33,6 @@ _MEASURED_READINGS: Final = "mode-0 readings with decimals in CSB, which raspber
 _CONSTANT_READINGS: Final = "mode-0 readings with PV8.4, GS0 and whole centimeters, the constants of a raspberry_pi car"
 _WIDE_READINGS: Final = "mode-0 readings with GS over 1023, of a 12-bit converter"
 _WITH_MODES: Final = "arduino (or stm32: their bytes are usually the same)"
-TWO_CELLS_V: Final = 9.0
-"""Voltage above which a battery must have more than two cells: two full cells have 8.4 V."""
 
 
 class _PlatformEvidence(Struct):
