@@ -383,7 +383,7 @@ class CarGateway:
         if (slept_s := self._sleep.take()) > 0:
             self._publisher.on_bus_lost(now)
             if not MONOTONIC_COUNTS_SLEEP:
-                self._publisher.on_slept(slept_s)
+                self._publisher.on_slept(slept_s, now)
             self._control.on_sleep(slept_s, now, counted=MONOTONIC_COUNTS_SLEEP)
             self._wake.set()
         gap_s = now - self._alive_at - TICK_S

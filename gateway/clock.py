@@ -1,4 +1,4 @@
-"""Converts times of the event loop's monotonic clock to wall-clock times, and keeps their order."""
+"""Converts times of the event loop's monotonic clock to wall-clock times, and to ages that include sleeps."""
 
 import time
 from collections.abc import Callable
@@ -50,3 +50,19 @@ class WallClock:
         wall = self._wall_ns()
         error_ns = (self._monotonic_ns() - before) // 2
         return wall - before - error_ns, error_ns
+
+
+class Sleeps:
+    """The sleeps of the computer that the monotonic clock does not count. Times: s, monotonic."""
+
+    def __init__(self) -> None:
+        self._sleeps: list[tuple[float, float]] = []
+        """When the computer woke, and how long it had slept."""
+
+    def add(self, slept_s: float, now: float) -> None:
+        """Record that the computer has slept, and is awake now."""
+        self._sleeps.append((now, slept_s))
+
+    def age_s(self, at: float, now: float) -> float:
+        """Return how long ago `at` was, at least 0, with the sleeps since then."""
+        return max(0.0, now - at) + sum(slept_s for woke_at, slept_s in self._sleeps if at < woke_at)

@@ -14,7 +14,7 @@ import zenoh
 
 from gateway.bus.history_buffer import BadRange, HistoryBuffer, Value
 from gateway.bus.process_stats import ProcessStats
-from gateway.clock import WallClock
+from gateway.clock import Sleeps, WallClock
 from gateway.control.control_output import CommandRecord, LogRecord, OutgoingFrame
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, DriverClaims, Event
@@ -74,6 +74,7 @@ class CarPublisher:
             if topic.history_size:
                 self._histories[topic.name] = HistoryBuffer(topic.history_size)
         self._wall = WallClock()
+        self._sleeps = Sleeps()
         self._raw = TokenBucket(RAW_PER_S, RAW_BURST)
         self._process = ProcessStats()
         self._bus_lost_at = float("-inf")
@@ -246,21 +247,22 @@ class CarPublisher:
         message = _CLASSES[name]()
         match name:
             case "state/link":
-                _fill_link(message, health, self._url, now)
+                _fill_link(message, health, self._url, now, self._sleeps)
                 if control.driver.lost_frames:
                     message.rejects["not_obeyed"] = control.driver.lost_frames
             case "state/mode":
-                _fill_mode(message, control, now)
+                _fill_mode(message, control, now, self._sleeps)
             case "state/motion":
                 _fill_motion(message, control, now)
             case _:
-                _fill_safety(message, control, now)
+                _fill_safety(message, control, now, self._sleeps)
         self._put_state(name, message, now)
 
     def publish_health(self, now: float, *, loop_lag_s: float, bus_drops: int) -> None:
         """Publish the health of the process, and the profile in force."""
         message = _CLASSES["state/health"]()
         self._process.fill(message, now)
+        message.uptime_s = self._sleeps.age_s(self._process.started, now)
         message.host = socket.gethostname()
         message.link = self._url
         message.version = VERSION
@@ -277,8 +279,9 @@ class CarPublisher:
         self._published_at[name] = now
         self._put_kept(name, message, now, self._wall.ns(now))
 
-    def on_slept(self, slept_s: float) -> None:
-        """Add a sleep of the computer (s) to the age of the stored values: the monotonic clock does not count it."""
+    def on_slept(self, slept_s: float, now: float) -> None:
+        """Add a sleep of the computer (s) to the ages of values and claims: the monotonic clock does not count it."""
+        self._sleeps.add(slept_s, now)
         for history in self._histories.values():
             history.age(slept_s)
 
@@ -328,7 +331,7 @@ def _fill_findings(message: pb.Health, model: DriverClaims) -> None:
     message.MergeFrom(type(message)(**findings.numbers))
 
 
-def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> None:
+def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float, sleeps: Sleeps) -> None:
     message.state = health.state
     message.reason = health.reason
     message.url = url
@@ -339,21 +342,21 @@ def _fill_link(message: pb.Link, health: LinkHealth, url: str, now: float) -> No
     message.rejects.update(health.rejects)
     message.reconnects = health.reconnects
     message.tx_airtime = health.airtime(now)
-    message.since_s = now - health.since
+    message.since_s = sleeps.age_s(health.since, now)
     if health.last_rx_at is not None:
-        message.last_rx_s = max(0.0, now - health.last_rx_at)
+        message.last_rx_s = sleeps.age_s(health.last_rx_at, now)
 
 
-def _fill_mode(message: pb.Mode, control: Controller[Driver], now: float) -> None:
+def _fill_mode(message: pb.Mode, control: Controller[Driver], now: float, sleeps: Sleeps) -> None:
     mode = control.driver.model.mode
     message.asked = mode.asked or UNKNOWN
     message.inferred = mode.inferred or UNKNOWN
     message.verdict = mode.verdict
     message.evidence = mode.evidence
     if mode.evidence_at is not None:
-        message.evidence_age_s = max(0.0, now - mode.evidence_at)
+        message.evidence_age_s = sleeps.age_s(mode.evidence_at, now)
     if mode.since is not None:
-        message.since_s = max(0.0, now - mode.since)
+        message.since_s = sleeps.age_s(mode.since, now)
     message.candidates.extend(mode.candidates)
 
 
@@ -382,7 +385,7 @@ def _fill_motion(message: pb.Motion, control: Controller[Driver], now: float) ->
         message.servo_deg = model.outputs.servo_deg
 
 
-def _fill_safety(message: pb.Safety, control: Controller[Driver], now: float) -> None:
+def _fill_safety(message: pb.Safety, control: Controller[Driver], now: float, sleeps: Sleeps) -> None:
     safety = control.safety
     for estop in safety.estops:
         scope = Scope.FLEET if estop.fleet_wide else Scope.CAR
@@ -414,9 +417,9 @@ def _fill_safety(message: pb.Safety, control: Controller[Driver], now: float) ->
     message.trust = trust.state
     message.trust_evidence = trust.evidence
     if trust.since > float("-inf"):
-        message.trust_since_s = max(0.0, now - trust.since)
+        message.trust_since_s = sleeps.age_s(trust.since, now)
     if trust.shown_at is not None:
-        message.shown_age_s = max(0.0, now - trust.shown_at)
+        message.shown_age_s = sleeps.age_s(trust.shown_at, now)
     message.worst_stop_s = control.driver.worst_s(now)
     message.waits_for = control.waits_for(now)
 

@@ -1,4 +1,4 @@
-"""Measures CPU, memory and uptime of the gateway's process."""
+"""Measures CPU and memory of the gateway's process."""
 
 import os
 import sys
@@ -12,18 +12,18 @@ _STATM: Final = Path("/proc/self/statm")
 
 
 class ProcessStats:
-    """CPU, memory and uptime of this process."""
+    """CPU and memory of this process, and when it started."""
 
     def __init__(self) -> None:
-        self._started = time.monotonic()
+        self.started = time.monotonic()
+        """Time of the start, s, monotonic."""
         self._cpu_s = time.process_time()
-        self._at = self._started
+        self._at = self.started
 
     def fill(self, message: pb.Health, now: float) -> None:
-        """Fill in pid, uptime, CPU share since the last call, and memory."""
+        """Fill in pid, CPU share since the last call, and memory."""
         cpu_s = time.process_time()
         message.pid = os.getpid()
-        message.uptime_s = now - self._started
         message.cpu = (cpu_s - self._cpu_s) / max(now - self._at, 1e-3)
         message.rss_mb = _rss_mb()
         self._cpu_s, self._at = cpu_s, now

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from gateway.clock import MAX_ATTEMPTS, MIN_STEP_NS, WallClock
+from gateway.clock import MAX_ATTEMPTS, MIN_STEP_NS, Sleeps, WallClock
 
 EPOCH_NS = 1_795_000_000_000_000_000
 MS = 1_000_000
@@ -71,3 +71,11 @@ def test_slewed_wall_clock_is_followed_in_steps() -> None:
         stamps.append(wall.ns(4.0) - 4_000 * MS)
         assert clocks.ahead - stamps[-1] <= MIN_STEP_NS + 1_000
     assert 4 <= len(set(stamps)) <= 6
+
+
+def test_age_includes_the_sleeps_since_then() -> None:
+    sleeps = Sleeps()
+    assert sleeps.age_s(10.0, 12.5) == 2.5
+    sleeps.add(100.0, 20.0)
+    sleeps.add(1000.0, 30.0)
+    assert [sleeps.age_s(at, 31.0) for at in (10.0, 20.0, 25.0, 30.0, 32.0)] == [1121.0, 1011.0, 1006.0, 1.0, 0.0]

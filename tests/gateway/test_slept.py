@@ -73,6 +73,26 @@ async def test_sleep_is_noticed_without_any_command_or_reading(tmp_path: Path) -
         assert codes.count("slept") == 1
 
 
+async def test_ages_of_claims_include_sleep(tmp_path: Path) -> None:
+    """A car that stood before the sleep showed that an hour ago, not just now."""
+    computer = SleepingLaptop()
+    async with standing(tmp_path, computer) as (fleet, _, codes):
+        computer.slept_s += 3600.0
+        await asyncio.to_thread(wait_for, lambda: "slept" in codes, "it says that it slept")
+        for name, field in (
+            ("safety", "shown_age_s"),
+            ("safety", "trust_since_s"),
+            ("link", "since_s"),
+            ("mode", "since_s"),
+            ("health", "uptime_s"),
+        ):
+            await asyncio.to_thread(
+                wait_for, lambda name=name, field=field: getattr(fleet.state(name), field) > 3600.0, f"{name} {field}"
+            )
+        safety = await asyncio.to_thread(fleet.state, "safety")
+        assert (safety.motors, safety.motors_basis) == ("off", "shown")
+
+
 async def test_true_motors_stop_after_a_sleep_and_stay_off(tmp_path: Path) -> None:
     """The car does not sleep: it drives on meanwhile."""
     laptop = SleepingLaptop()

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from fleet.console.rights_in_words import management_refusal, rights_of
 from fleet.console.rights_in_words import refusals as refusals_shown
 from gateway.bus.car_publisher import _fill_safety
+from gateway.clock import Sleeps
 from gateway.control import refusals
 from gateway.control.commands import (
     Action,
@@ -87,7 +88,7 @@ def cars() -> Iterator[tuple[refusals.CommandContext, Authority]]:
         if lease is not None:
             safety.lease = LeaseState(lease, NOW + 1.0)
         message = pb.Safety()
-        _fill_safety(message, control, NOW)
+        _fill_safety(message, control, NOW, Sleeps())
         yield control._context(NOW), Authority.of(message)
 
 
