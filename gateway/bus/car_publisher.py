@@ -261,7 +261,7 @@ class CarPublisher:
     def publish_health(self, now: float, *, loop_lag_s: float, bus_drops: int) -> None:
         """Publish the health of the process, and the profile in force."""
         message = _CLASSES["state/health"]()
-        self._process.fill(message, now)
+        self._process.fill(message)
         message.uptime_s = self._sleeps.age_s(self._process.started, now)
         message.host = socket.gethostname()
         message.link = self._url
