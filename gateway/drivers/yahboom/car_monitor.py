@@ -178,7 +178,7 @@ class CarMonitor:
             return
         before = model.profile.kind
         model.treat_as(model.platform.profile)
-        words = f"{model.name} counts as {model.profile.name}: {model.platform.evidence[0]}"
+        words = ": ".join((f"{model.name} counts as {model.profile.name}", *model.platform.evidence[:1]))
         if model.platform.auto:  # otherwise the log has the new platform already, in the warning of the contradiction
             self._log.log(Level.INFO, "platform_settled", words, now)
         if has_other_head and self._is_idle:  # motions are general frames, which have no head, so let a drive go on

@@ -136,8 +136,8 @@ class PlatformDetector:
 
     @property
     def evidence(self) -> tuple[str, ...]:
-        """Return the evidence for the profile, its contradictions, and its properties that were never observed."""
-        return (*self._evidence_for_profile(), *self.contradictions, *self.profile.not_observed)
+        """Return the evidence for the profile, and its contradictions."""
+        return (*self._evidence_for_profile(), *self.contradictions)
 
     def on_event(self, event: Event, *, counts: bool = True) -> tuple[str, ...]:
         """Update the evidence, and with `auto` the profile. Return new contradictions, in words.

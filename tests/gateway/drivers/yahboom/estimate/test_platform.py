@@ -89,6 +89,12 @@ def test_one_damaged_frame_never_contradicts(bursts: list[tuple[int, str]]) -> N
     assert auto.profile.name == "arduino"
 
 
+@pytest.mark.parametrize("platform", ["arduino", "stm32", "raspberry_pi"])
+def test_nothing_shows_a_named_platform(platform: str) -> None:
+    """That a property of such cars was never observed is no evidence for the platform."""
+    assert PlatformDetector(parse_platform(platform)).evidence == ()
+
+
 def test_auto_adds_the_options_that_it_hears() -> None:
     truth = PlatformDetector(parse_platform("unknown"), auto=True)
     hear(truth, ARM, ARM, ARM)
