@@ -15,7 +15,11 @@ from msgspec.structs import replace
 
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.platforms import SPEEDS, Profile, SpeedModel
-from schemas.words import Mode, Motion, Platform, SpeedStep
+from schemas.words import Mode, Motion, Platform, ServoAction, SpeedStep
+
+_FRONT_STEPS = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
+# The car looks around in avoidance, and sweeps in color LED mode. In remote control, a person may turn the servo.
+_TURN_SERVO = frozenset({Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED})
 
 Speeds = dict[Platform, frozenset[float]]
 """For each platform, the speeds that a car with such a program may have, in its own unit."""
@@ -42,6 +46,7 @@ class StateEstimate:
     fan_toggled: bool = False
     """True if the fan was toggled, and no reading has arrived since it reached its new state."""
     servo_deg: int | None = None
+    """The last number sent to the front servo, or None if the servo may have turned to another angle since then."""
     led: ColorLed = field(default_factory=lambda: ColorLed(0, 0, 0))
     speeds: Speeds = field(default_factory=speeds_at_start)
 
@@ -51,7 +56,8 @@ class StateEstimate:
         return share_of(self.speeds, self.profile.kind)
 
     def allow_restart(self) -> None:
-        """Allow for a car that was switched off and on, and has the speed of its start now."""
+        """Allow for a car that was switched off and on, and has the speed and the servo angle of its start now."""
+        self.servo_deg = None
         self.speeds = {kind: speeds | {SPEEDS[kind].start} for kind, speeds in self.speeds.items()}
 
     def allow(self, speeds: Speeds) -> None:
@@ -65,6 +71,8 @@ class StateEstimate:
                 if frame.motion is not Motion.STOP:
                     self.repeat = self.repeat or frame.motion is not self.motion
                 self.motion = frame.motion
+                if frame.servo in _FRONT_STEPS:
+                    self.servo_deg = None
                 if frame.speed is not None:
                     self.speeds = stepped(self.speeds, frame.speed)
                 if self.profile.fan_is_level:
@@ -78,6 +86,8 @@ class StateEstimate:
                 self.motion = Motion.STOP
             case ModeOpen(mode):
                 self.speeds = {kind: _after_mode(SPEEDS[kind], at, mode) for kind, at in self.speeds.items()}
+                if mode in _TURN_SERVO:
+                    self.servo_deg = None
             case Ptz(deg):
                 self.servo_deg = deg
             case ColorLed():

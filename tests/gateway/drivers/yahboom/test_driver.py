@@ -1,13 +1,15 @@
-"""What a driver of this family refuses."""
+"""What a driver of this family refuses, and what it claims of the parts of a car."""
 
 import pytest
 
-from gateway.control.commands import ChangeSpeed, Drive
+from gateway.control.commands import Action, AimServo, ChangeSpeed, Drive, Led, MoveServo, SetMode
 from gateway.drivers.yahboom.estimate.outputs import StateEstimate
 from gateway.drivers.yahboom.protocol.frames import General, ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import SPEEDS, parse_platform
-from schemas.words import Mode, Motion, Platform, SpeedStep
+from schemas.words import Mode, Motion, Platform, ServoAction, SpeedStep
 from tests.support.controls import control
+from tests.support.truth import near_walls
+from tests.support.virtual import Pair
 
 
 @pytest.mark.parametrize(
@@ -80,3 +82,49 @@ def test_car_is_never_faster_than_believed(platform: str, mode: Mode) -> None:
             assert speed.fraction(true) <= believed.share
             believed.on_written(General(Motion.STOP, speed=step), 0.0)
             true = speed.step(true, step)
+
+
+@pytest.mark.parametrize(
+    "turns",
+    [
+        [MoveServo(ServoAction.FRONT_LEFT)],
+        [MoveServo(ServoAction.FRONT_RESET)],
+        [SetMode(Mode.COLOR_LED), SetMode(Mode.MANUAL)],
+        [SetMode(Mode.OBSTACLE_AVOIDANCE), SetMode(Mode.MANUAL)],
+    ],
+)
+def test_no_angle_is_claimed_once_the_servo_may_have_turned(turns: list[Action]) -> None:
+    pair = Pair("arduino", world=near_walls()).ready()
+    pair.ask(AimServo(30))
+    pair.run(3.0)
+    assert (pair.control.driver.model.outputs.servo_deg, pair.car.truth.servo) == (30, 150)
+    for action in turns:
+        pair.ask(action)
+        pair.run(12.0)
+    assert pair.car.truth.servo != 150
+    assert pair.control.driver.model.outputs.servo_deg is None
+    pair.ask(AimServo(40))
+    pair.run(12.0)
+    assert (pair.control.driver.model.outputs.servo_deg, pair.car.truth.servo) == (40, 140)
+
+
+@pytest.mark.parametrize(
+    "action", [SetMode(Mode.TRACKING), Drive(Motion.FORWARD), ChangeSpeed(SpeedStep.UP), Led(1, 2, 3)]
+)
+def test_angle_is_claimed_as_long_as_nothing_turns_the_servo(action: Action) -> None:
+    pair = Pair("arduino").ready()
+    pair.ask(AimServo(30))
+    pair.run(3.0)
+    pair.ask(action)
+    pair.run(6.0)
+    assert (pair.control.driver.model.outputs.servo_deg, pair.car.truth.servo) == (30, 150)
+
+
+def test_no_angle_is_claimed_after_the_car_was_out_of_reach() -> None:
+    pair = Pair("arduino").ready()
+    pair.ask(AimServo(30))
+    pair.run(3.0)
+    pair.lose()
+    pair.run(1.0, linked=False)
+    pair.ready()
+    assert pair.control.driver.model.outputs.servo_deg is None, "it may have been switched off, or be another car"
