@@ -18,6 +18,8 @@ FEEDBACK: Final = 1001
 """Value of `T` in a feedback."""
 MAX_M_S: Final = 5.0
 """Maximum speed of a wheel. A greater number is not a measurement."""
+MAX_DEG: Final = 360.0
+"""Maximum angle. A greater number is not a measurement: without a checksum, a lost decimal point makes one."""
 _IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 _OF_ARM: Final = frozenset({"torB", "torS", "torE", "torH"})
 """Fields that only a car with an arm sends. Such a car sends positions of the arm in the fields of the yaw or the
@@ -40,7 +42,7 @@ class Feedback(Struct, frozen=True):
     """Speeds of the wheels as the car reports them. They are measured only if `Chassis.has_encoders`."""
     voltage_v: float | None
     attitude_rad: tuple[float, float, float] | None
-    """Roll, pitch, yaw."""
+    """Roll, pitch, yaw, each -pi..pi."""
     odometer_m: tuple[float, float] | None
     imu_raw: tuple[float, ...] | None
     """Gyroscope and acceleration x, y, z, without a unit."""
@@ -82,7 +84,7 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
     firmware = firmware_of(found, _number(found, "v") or 0.0)
     has_arm = not _OF_ARM.isdisjoint(found)
     has_attitude = firmware is UgvFirmware.GENERAL and not has_arm
-    attitude = _tuple(found, ("r", "p", "y"), math.radians(1.0)) if has_attitude else None
+    attitude = _attitude(_tuple(found, ("r", "p", "y"), 1.0)) if has_attitude else None
     odometer = _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None
     imu = _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS and not has_arm else None
     return Feedback(raw, at, firmware, left, right, _voltage(found, firmware), attitude, odometer, imu)
@@ -95,6 +97,14 @@ def _voltage(found: dict[str, Any], firmware: UgvFirmware | None) -> float | Non
         return None
     volts = value if firmware is UgvFirmware.GENERAL else value / 100
     return volts if 0.0 < volts <= MAX_V else None
+
+
+def _attitude(angles_deg: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    """Return the angles in rad, -pi..pi. None if one of them is not an angle. A program may count to 360 degrees."""
+    if angles_deg is None or max(map(abs, angles_deg)) > MAX_DEG:
+        return None
+    roll, pitch, yaw = (math.remainder(math.radians(each), math.tau) for each in angles_deg)
+    return roll, pitch, yaw
 
 
 def _tuple(found: dict[str, Any], names: tuple[str, ...], unit: float) -> Any:

@@ -57,6 +57,15 @@ def test_numbers_of_an_arm_are_no_angles() -> None:
 
 
 @pytest.mark.parametrize(
+    ("yaw_deg", "yaw_rad"),
+    [(180, math.pi), (-180, -math.pi), (270, -math.pi / 2), (-188.5, math.radians(171.5)), (360, 0.0), (12345, None)],
+)
+def test_angles_are_within_half_a_turn_or_none(yaw_deg: float, yaw_rad: float | None) -> None:
+    attitude = read({**GENERAL, "y": yaw_deg}).attitude_rad
+    assert attitude is None if yaw_rad is None else attitude[2] == pytest.approx(yaw_rad)
+
+
+@pytest.mark.parametrize(
     ("fields", "cause"),
     [
         ({"T": 1001, "R": 0}, Cause.MISSING_WORD),
