@@ -60,7 +60,8 @@ def describe_gateway(link: Any, health: Any, safety: Any, mode: Any) -> list[tup
         rows.append(("loop lag", f"{health.loop_lag_s * 1e3:.0f} ms"))
     if safety is not None:
         rows += [("trust", safety.trust), ("trust evidence", safety.trust_evidence)]
-        rows.append(("a stop now takes at most", f"{safety.worst_stop_s:.2f} s"))
+        longest = f"{safety.worst_stop_s:.2f} s" if safety.HasField("worst_stop_s") else "unknown: the link is down"
+        rows.append(("a stop now takes at most", longest))
     if mode is not None:
         rows += [("mode evidence", mode.evidence), ("possible modes", ", ".join(mode.candidates))]
     return [(name, text) for name, text in rows if text]

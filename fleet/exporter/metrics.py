@@ -208,7 +208,7 @@ CAR_METRICS: Final = (
         "longest time that a stop would take now",
         Unit.SECONDS,
         panel="Longest stop",
-        values=_number("state/safety", lambda safety: safety.worst_stop_s),
+        values=_number("state/safety", lambda safety: safety.worst_stop_s if safety.HasField("worst_stop_s") else None),
     ),
     CarMetric(
         "fleet_car_received_bytes",

@@ -420,7 +420,8 @@ def _fill_safety(message: pb.Safety, control: Controller[Driver], now: float, sl
         message.trust_since_s = sleeps.age_s(trust.since, now)
     if trust.shown_at is not None:
         message.shown_age_s = sleeps.age_s(trust.shown_at, now)
-    message.worst_stop_s = control.driver.worst_s(now)
+    if model.link_open:
+        message.worst_stop_s = control.driver.worst_s(now)
     message.waits_for = control.waits_for(now)
 
 

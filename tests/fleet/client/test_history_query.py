@@ -278,7 +278,10 @@ def test_csv_columns_do_not_depend_on_measured_fields() -> None:
             io.StringIO(table([Reading("fleet/red/state/safety", NOW, safety)], topics.TOPICS["state/safety"]))
         )
     )
-    assert (row["hold"], row["lease"], row["worst_stop_s"]) == ('{"by": "ann"}', "", "0.0")
+    assert (row["hold"], row["lease"], row["worst_stop_s"]) == ('{"by": "ann"}', "", "")
+    motion = [Reading("fleet/red/state/motion", NOW, pb.Motion(motion="stop"))]
+    row = next(csv.DictReader(io.StringIO(table(motion, topics.TOPICS["state/motion"]))))
+    assert (row["speed"], row["servo_deg"]) == ("0.0", "")
 
 
 def test_every_units_column_is_named_once() -> None:

@@ -148,6 +148,7 @@ def test_states_leave_out_what_does_not_apply(published: Published) -> None:
     assert "last_rx_s" not in states["state/link"], "nothing was heard"
     assert "evidence_age_s" not in states["state/mode"], "there is no evidence"
     assert "expires_in_s" not in states["state/motion"], "nobody holds a motion"
+    assert "worst_stop_s" not in states["state/safety"], "no stop can reach the car: there is no link"
     desk.ready()
     health.on_bytes(9, desk.now - 0.5)
     desk.ask(Drive(Motion.FORWARD, 5.0))
@@ -155,6 +156,9 @@ def test_states_leave_out_what_does_not_apply(published: Published) -> None:
     assert states["state/link"]["last_rx_s"] == pytest.approx(0.5)
     assert states["state/mode"]["evidence_age_s"] >= 0
     assert states["state/motion"]["expires_in_s"] == pytest.approx(5.0)
+    assert states["state/safety"]["worst_stop_s"] > 0
+    desk.control.driver.link_down("unplugged", desk.now)
+    assert "worst_stop_s" not in published.states()["state/safety"]
 
 
 def test_records_leave_out_what_does_not_apply(published: Published) -> None:
