@@ -498,17 +498,21 @@ class PlainDriver(Driver):
         """Return when `poll` may have something to do if nothing happens earlier, or inf if never."""
         if not self._model.link_open:
             return float("inf")
-        times = [*self.queue.deadlines(), self.setup_at()]
+        times = self.queue.deadlines()
         stop, held = self._stop, self.queue.held
         if stop is not None:
             later = [self._ends_at]  # only times to come: `poll` has handled the others
-            if stop.index >= self.STOP_FRAMES:
+            times.append(stop.next_at)
+            if stop.index >= self.STOP_FRAMES:  # before, `poll` writes no other frame between those of the stop
                 later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
-            times += [stop.next_at, *(each for each in later if each > now)]
-            if not self.wait_words(now):
-                part_at = now if self._has_new_motion(stop) else max(self._part_at, self.queue.part_at)
-                times.append(max(self.free_at(now), part_at))
-        elif not self.wait_words(now):
+                times.append(self.setup_at())
+                if not self.wait_words(now):
+                    part_at = now if self._has_new_motion(stop) else max(self._part_at, self.queue.part_at)
+                    times.append(max(self.free_at(now), part_at))
+            times += [each for each in later if each > now]
+            return max(now, min(times))
+        times.append(self.setup_at())
+        if not self.wait_words(now):
             if held is not None and not held.pending.sent:
                 times.append(now)
             times.append(max(self._part_at, self.queue.part_at))

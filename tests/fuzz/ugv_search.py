@@ -109,13 +109,16 @@ class UgvEpisode:
         if self.now >= self._tick_at:
             self._tick_at = self.now + TICK_S
             self.control.tick(self.now)
-        while self.linked and (write := self.control.driver.poll(self.now)) is not None:
+        # `poll` may end a stop and return None. What it wants at once after that, it writes at the next call.
+        while self.linked and (write := driver.poll(self.now) or driver.poll(self.now)) is not None:
             driver.sends(write.data, self.now)
             self.control.driver.on_written(write, self.now)
             self.sent.append((self.now, write.data))
             self._check_line(write.data)
             if not self._is_lost():
                 self.to_car.append((self.now + self.delay_s, write.data))
+        if self.linked and driver.next_at(self.now) <= self.now:
+            self.faults.append(f"{self.now:.2f} s: the loop never sleeps")
         while self.to_car and self.to_car[0][0] <= self.now:
             self.car.feed(self.to_car.pop(0)[1], self.now)
         self._take_records()
