@@ -294,7 +294,7 @@ class Controller(Generic[D_co]):
             words = f"{words} ({command.note})" if command.note else words
             return self._reject(pending, Reason.LINK_DOWN, words, now)
         if not self.driver.model.is_heard:
-            silent_s = self.driver.model.unheard_s(now)
+            silent_s = self.driver.model.silent_s(now)
             silent = f"{self.car} may not get this stop: it has been silent for {silent_s:.0f} s. Look at the car."
             note = f"{silent} ({note})" if note else silent
         worst = self.driver.worst_s(now)
@@ -557,7 +557,7 @@ class Controller(Generic[D_co]):
         return Answer(Phase.QUEUED, words=words)
 
     def _silent(self, now: float) -> str:
-        silent_s = self.driver.model.unheard_s(now)
+        silent_s = self.driver.model.silent_s(now)
         return f"{self.car} has been silent for {silent_s:.0f} s: nothing shows that it hears this"
 
     def _reject(self, pending: Pending, reason: Reason, words: str, now: float) -> Answer:

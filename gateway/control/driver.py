@@ -230,7 +230,10 @@ class DriverClaims(Protocol):
         """Why a silence is normal now, as a text for a person."""
 
     def unheard_s(self, now: float) -> float:
-        """Return how long the car has been silent, s."""
+        """Return how long the car has been silent, s, without times in which it is normally silent."""
+
+    def silent_s(self, now: float) -> float:
+        """Return how long ago the last reading of this link arrived, or how long the link is open without one, s."""
 
     def moved_since(self, range_cm: float | None, since: float) -> str:
         """Describe the reading that shows that a drive moved the car. Empty if none does.

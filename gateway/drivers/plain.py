@@ -160,6 +160,10 @@ class PlainModel(Struct):
         """Return how long the car has sent no reading on this link, s."""
         return now - max(self.link_since, self.link_since if self.heard_at is None else self.heard_at)
 
+    def silent_s(self, now: float) -> float:
+        """Return the same: no silence of such a car is excused."""
+        return self.unheard_s(now)
+
     def moved_since(self, range_cm: float | None, since: float) -> str:
         """Describe the reading since `since` that shows that a drive moved the car. Empty if none does."""
         if self.turned_at > since:

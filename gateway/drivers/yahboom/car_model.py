@@ -128,6 +128,10 @@ class CarModel:
         """Return how long the car has been silent, without the time for which our frames kept it busy."""
         return self.mode.unheard_s(now)
 
+    def silent_s(self, now: float) -> float:
+        """Return how long ago the last reading of this link arrived, or how long the link is open without one, s."""
+        return now - max(self.link_since, self.mode.heard_at)
+
     @property
     def known(self) -> bool:
         """Return True if the car reads frames as they are meant."""

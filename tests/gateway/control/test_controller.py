@@ -1001,3 +1001,16 @@ def test_mode_behind_a_waiting_action_keeps_no_loop_busy() -> None:
     pair.ask(SetMode(Mode.LIGHT_SEEKING))
     pair.run(6.0)  # fails if the loop never sleeps
     assert pair.car.truth.mode is Mode.LIGHT_SEEKING
+
+
+def test_answers_say_how_long_the_car_has_really_been_silent() -> None:
+    """While it is silent, the gateway stops it again and again. The times in which that keeps it busy count, too."""
+    pair = Pair("arduino").ready()
+    pair.deaf_until = float("inf")
+    heard_at = pair.control.driver.model.mode.heard_at
+    pair.until(lambda: not pair.control.driver.model.is_heard, 20.0)
+    for _ in range(8):
+        pair.run(7.3)
+        silent = f"silent for {pair.now - heard_at:.0f} s"
+        assert silent in pair.ask(Stop()).words
+    assert silent in pair.ask(Drive(Motion.FORWARD, 0.2)).words
