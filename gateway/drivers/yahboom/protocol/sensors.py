@@ -18,6 +18,8 @@ Value = bool | int | float | tuple[float, ...]
 Fields = dict[str, Value]
 """The values of one message, by field."""
 
+RANGE_STEP_M: Final = 0.0001
+"""Resolution of a published distance: cars send hundredths of a centimeter."""
 _BITS_2: Final = {b"%d%d" % (a, b): (bool(a), bool(b)) for a in (0, 1) for b in (0, 1)}
 _BITS_4: Final = {left + right: (*_BITS_2[left], *_BITS_2[right]) for left in _BITS_2 for right in _BITS_2}
 
@@ -51,8 +53,8 @@ class SensorField(Struct, frozen=True):
 
 
 def _range(range_cm: float) -> Fields:
-    # A range of 0 is no echo, not a distance (docs/reference/protocol.md#ranges).
-    return {"no_echo": False, "range_m": round(range_cm / 100, 4)} if range_cm else {"no_echo": True}
+    # A range of 0 is no echo, not a distance (docs/reference/protocol.md#ranges). So no distance is rounded to 0.
+    return {"no_echo": False, "range_m": max(RANGE_STEP_M, round(range_cm / 100, 4))} if range_cm else {"no_echo": True}
 
 
 def _line(bits: tuple[bool, bool, bool, bool]) -> Fields:

@@ -16,7 +16,7 @@ from gateway.drivers.yahboom.protocol.frames import (
     Ptz,
     parse_sent,
 )
-from gateway.drivers.yahboom.protocol.measurements import verdict_of
+from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
 from gateway.drivers.yahboom.protocol.modes import EVERY_MEASUREMENT, MODES, candidate_modes, only_candidate
 from gateway.drivers.yahboom.protocol.platforms import SPEEDS, StopStyle, parse_platform
 from gateway.drivers.yahboom.protocol.sensors import Sensors
@@ -219,6 +219,20 @@ def test_field_range_depends_on_platform(platform: str, text: str, rejected: str
 def test_field_out_of_every_range_is_rejected_once() -> None:
     event = sensors(b"$4WD,CSB1300,PV14,GS5000,LF1011,HW01,GM10#", "#")
     assert parse_platform("arduino").rejects(event) == event.rejects
+
+
+@pytest.mark.parametrize(
+    ("text", "fields"),
+    [
+        (b"0.00", {"no_echo": True}),
+        (b"0.004", {"no_echo": False, "range_m": 0.0001}),
+        (b"57.24", {"no_echo": False, "range_m": 0.5724}),
+        (b"1200", {"no_echo": False, "range_m": 12.0}),
+    ],
+)
+def test_only_no_echo_is_published_without_a_distance(text: bytes, fields: dict[str, float]) -> None:
+    event = sensors(b"$4WD,CSB%b,PV7.91,GS5,LF0000,HW00,GM00#" % text, "#")
+    assert measured(event, parse_platform("arduino"), None)["sensor/range"] == fields
 
 
 def test_stm32_constants_are_no_measurements() -> None:
