@@ -7,6 +7,8 @@ from collections.abc import Callable, Coroutine, Iterable, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
+from msgspec import Struct
+
 from fleet.aio import Fleet
 from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import CommandRequest, drive_request, lease_request
@@ -29,6 +31,13 @@ STREAM_MAX_AGE_S: Final = 0.3
 log = logging.getLogger("fleet")
 
 
+class _Take(Struct, eq=False):
+    """Some cars that a page takes over. `wanted` are those that it has not given back meanwhile."""
+
+    page: int
+    wanted: set[str]
+
+
 class ConsoleOperator:
     """The client of the bus under whose name the pages of one person act."""
 
@@ -39,6 +48,8 @@ class ConsoleOperator:
         """Time of the last drive, number of drives, and cars, by press."""
         self._leases: dict[str, int] = {}
         """The page that has taken each car over, by car."""
+        self._takes: list[_Take] = []
+        """The cars that pages are taking over, without an answer of a gateway yet."""
         self._stops: dict[tuple[str, str], PendingCommand] = {}
         """The newest stop of all cars that has no outcome yet, by sender and verb."""
         self._renewals: set[str] = set()
@@ -159,12 +170,23 @@ class ConsoleOperator:
 
         Return the task that waits for the outcomes.
         """
+        take = _Take(client, set(cars))
+        self._takes.append(take)
 
         def keep(outcomes: list[dict[str, Any]]) -> None:
-            self._leases.update({outcome["car"]: client for outcome in outcomes if outcome["ok"]})
+            self._keep(take, {outcome["car"] for outcome in outcomes if outcome["ok"]})
             on_outcomes(outcomes)
 
-        return self.command(lease_request(take=True), cars, keep)
+        taking = self.command(lease_request(take=True), cars, keep)
+        taking.add_done_callback(lambda _: self._takes.remove(take))
+        return taking
+
+    def _keep(self, take: _Take, taken: set[str]) -> None:
+        """Keep the leases that a page still wants. Give the others back: without a page, nobody else would."""
+        self._leases |= dict.fromkeys(taken & take.wanted, take.page)
+        others = (each.wanted for each in self._takes if each is not take)
+        if unwanted := sorted(taken - set(self._leases).union(*others)):
+            self.command(lease_request(release=True), unwanted, lambda _: None)
 
     def release_leases(
         self,
@@ -180,6 +202,11 @@ class ConsoleOperator:
         released = taken if cars is None else list(cars)
         for car in released:
             self._leases.pop(car, None)
+        for take in self._takes:  # the gateways may answer when nobody waits any more
+            if cars is not None:
+                take.wanted.difference_update(released)
+            elif take.page == client:
+                take.wanted.clear()
         return self.command(lease_request(release=True), released, on_outcomes) if released else None
 
     def renew_leases(self) -> None:

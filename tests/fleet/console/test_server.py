@@ -699,6 +699,27 @@ def test_stops_of_some_cars_are_merged_and_each_is_answered(stage: ServerStage) 
     assert 1 <= len(begun) <= STOPS_AT_ONCE / 4
 
 
+def test_page_that_goes_before_its_take_is_answered_leaves_no_lease(stage: ServerStage) -> None:
+    device, phases = stage.device("mia"), list[str]()
+    stage.person.ask(resume_request(), ["red"])
+    subscribed = stage.fleet.bus.subscribe("fleet/red/event/command", partial(note_lease, phases=phases))
+    with device.socket() as other:  # her client stays as long as she has a page
+        with device.socket() as page:
+            page.recv()
+            page.send('{"t":"take","id":1,"cars":["red"]}')
+        wait_for(lambda: phases, "the gateway has got the take")
+        wait_for(lambda: not stage.fleet.state("safety").HasField("lease"), "nobody has red")
+        assert next_message(other, "tick")
+    subscribed.undeclare()
+
+
+def note_lease(sample: Sample, phases: list[str]) -> None:
+    """Note the phase of a command for a lease."""
+    event: Any = sample.message()
+    if event.verb == "lease":
+        phases.append(event.phase)
+
+
 def note_stop(sample: Sample, begun: list[str]) -> None:
     """Note the person of a stop that a gateway has got."""
     event: Any = sample.message()
