@@ -48,7 +48,6 @@ from schemas.bus import Handover, Latest, Sample
 from schemas.colors import Rgb, car_color, hex_color
 from schemas.commands import STOPS, Verb
 from schemas.keys import SIMULATOR, person_of, replay_token, topic_key
-from schemas.limits import MAX_REASON_LENGTH
 from schemas.process.computer_sleep import SleepWatch, clock_pair
 from schemas.rights import People
 from schemas.topics import TOPICS
@@ -140,7 +139,7 @@ class Console:
             "release": self._on_release,
             # A page sends it to measure how long its messages take.
             "ping": lambda page, message: page.answer(t="pong", id=message.number("id")),
-            Verb.STOP: lambda page, message: self.stop_all(message.text("id"), page.operator),
+            Verb.STOP: lambda page, message: self.stop_all(message.text_if_valid("id"), page.operator),
             Verb.ESTOP: self._on_estop,
             Verb.PAUSE: self._on_pause,
             Verb.UNPAUSE: self._on_unpause,
@@ -521,14 +520,13 @@ class Console:
             page.operator.end_press(released)
 
     def _on_estop(self, page: PageLink, message: PageMessage) -> None:
-        why = message.text("why", MAX_REASON_LENGTH)
-        self.stop_all(message.text("id"), page.operator, estop_request(why, Scope.FLEET))
+        request = estop_request(message.reason, Scope.FLEET)
+        self.stop_all(message.text_if_valid("id"), page.operator, request)
 
     def _on_pause(self, page: PageLink, message: PageMessage) -> None:
-        why = message.text("why", MAX_REASON_LENGTH)
         if refused := rights_of(page.operator.sender, self._view.authority)["pause"]:
             raise BadPageMessage(refused)  # a refused pause stops no car, so it ends no press
-        self.stop_all(message.text("id"), page.operator, pause_request(why))
+        self.stop_all(message.text_if_valid("id"), page.operator, pause_request(message.reason))
 
     def _on_unpause(self, page: PageLink, message: PageMessage) -> None:
         answer = self._answer_to(page, message)
@@ -542,13 +540,15 @@ class Console:
         self._count(page, page.operator.release_leases(page.number, message.cars(), self._answer_to(page, message)))
 
     def _on_command(self, page: PageLink, message: PageMessage) -> None:
-        request, cars, answer = message.request(), message.cars(), self._answer_to(page, message)
+        request = message.request()
         if request.verb in STOPS:
+            cars, answer = message.stopped_cars(), self._answer_to_stop(page, message)
             self._end_all(self._presses.on_cars_stopped(set(cars)), "The car was stopped.")
             who = (page.operator.sender, request.verb)
             self._waiting_stops.setdefault(who, []).append((cars, answer))
             self._merge_stop(("cars", *who), partial(self._stop_cars, page.operator, request, who))
             return
+        cars, answer = message.cars(), self._answer_to(page, message)
         if request.verb == Verb.MODE:
             theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.people_of(cars))
             self._end_all(theirs, "The car is in a mode.")
@@ -609,6 +609,12 @@ class Console:
     def _answer_to(self, page: PageLink, message: PageMessage) -> Callable[[list[dict[str, Any]]], None]:
         request_id = message.number("id")
         return lambda outcomes: page.answer(t="done", id=request_id, outcomes=outcomes)
+
+    def _answer_to_stop(self, page: PageLink, message: PageMessage) -> Callable[[list[dict[str, Any]]], None]:
+        try:
+            return self._answer_to(page, message)
+        except BadPageMessage:  # a page that has given no number waits for no answer
+            return lambda _: None
 
     def _end_all(self, presses: Iterable[HeldPress], words: str) -> None:
         for press in presses:

@@ -13,7 +13,6 @@ from msgspec.structs import replace
 from fleet.client import commands
 from schemas import keys
 from schemas.commands import STOPPING_VERBS, STOPS, Verb
-from schemas.limits import MAX_REASON_LENGTH
 from schemas.words import Light, Mode, Motion, Scope, Servo, SpeedStep
 
 MAX_CARS: Final = 128
@@ -67,6 +66,19 @@ class PageMessage(Struct, frozen=True):
             raise BadPageMessage(f"{name} has invalid characters") from None
         return value
 
+    def text_if_valid(self, name: str, longest: int = 64) -> str:
+        """Return a text, or an empty one if it is not valid: a wrong detail must not make a stop fail."""
+        try:
+            return self.text(name, longest)
+        except BadPageMessage:
+            return ""
+
+    @property
+    def reason(self) -> str:
+        """The reason of a stop, which its request makes valid."""
+        value = self.fields.get("why", "")
+        return value if isinstance(value, str) else ""
+
     def number(self, name: str) -> int:
         """Return a whole number from 0. Raises BadPageMessage."""
         value = self.fields.get(name)
@@ -83,6 +95,17 @@ class PageMessage(Struct, frozen=True):
             return tuple(dict.fromkeys(keys.check_name(name) for name in value))
         except keys.BadKey as error:
             raise BadPageMessage(str(error)) from None
+
+    def stopped_cars(self) -> tuple[str, ...]:
+        """Return the cars of a stop. Wrong names are left out, and do not keep the others from being stopped.
+
+        Raises BadPageMessage if no name is left.
+        """
+        value = self.fields.get("cars")
+        names = (
+            [each for each in value if isinstance(each, str) and keys.is_name(each)] if isinstance(value, list) else []
+        )
+        return PageMessage({"cars": list(dict.fromkeys(names))[:MAX_CARS] or value}).cars()
 
     def motion(self) -> str:
         """Return a motion that moves the car. Raises BadPageMessage."""
@@ -174,5 +197,5 @@ _BUILDERS: Final[Mapping[str, Callable[[PageMessage], commands.CommandRequest]]]
     Verb.FAN: lambda _: commands.fan_request(),
     Verb.FIND: lambda _: commands.plain_request(Verb.FIND),
     Verb.STOP: lambda _: commands.stop_request(),
-    Verb.ESTOP: lambda message: commands.estop_request(message.text("why", MAX_REASON_LENGTH), Scope.CAR),
+    Verb.ESTOP: lambda message: commands.estop_request(message.reason, Scope.CAR),
 }

@@ -713,6 +713,30 @@ def test_page_that_goes_before_its_take_is_answered_leaves_no_lease(stage: Serve
     subscribed.undeclare()
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"t": "stop", "id": 5},
+        {"t": "stop", "id": "x" * 65},
+        {"t": "estop", "id": "odd", "why": "x" * 201},
+        {"t": "estop", "id": "half", "why": "half \ud83d"},
+        {"t": "do", "verb": "stop", "id": 1, "cars": ["red", "Not a car"]},
+        {"t": "do", "verb": "stop", "cars": ["red"]},
+        {"t": "do", "verb": "estop", "id": 1, "cars": ["red"], "why": 5},
+    ],
+)
+def test_stop_with_wrong_details_stops(stage: ServerStage, fields: dict[str, Any]) -> None:
+    with stage.device("stop").socket() as page:
+        page.recv()
+        stage.drive()
+        page.send(json.dumps(fields))
+        wait_for(lambda: not stage.judge.driving, "red stands")
+    if fields["t"] == "estop" or fields.get("verb") == "estop":
+        ids = [each.id for each in wait_for(lambda: stage.fleet.state("safety").estops, "red is e-stopped")]
+        stage.person.ask(resume_request(ids), ["red"])
+    stage.person.ask(resume_request(), ["red"])
+
+
 def note_lease(sample: Sample, phases: list[str]) -> None:
     """Note the phase of a command for a lease."""
     event: Any = sample.message()
