@@ -293,15 +293,18 @@ class FleetView:
         self._color_of = color_of
         self._cars: dict[str, CarView] = {}
         self._listed: frozenset[str] = frozenset()
+        self._removed: frozenset[str] = frozenset()
+        """Cars that `fleet reload` has removed. Each is forgotten when its gateway has gone."""
         self.left_out = ""
         """The first car for which there was no place, or the car that lost its place. Empty if there is no such car."""
 
-    def list_cars(self, names: Iterable[str]) -> None:
-        """Set the cars that the running fleet lists.
+    def list_cars(self, names: Iterable[str], removed: Iterable[str] = ()) -> None:
+        """Set the cars that the running fleet lists, and note those that it has listed and does not list any more.
 
         Cars beyond the maximum are treated as cars that it does not list.
         """
         self._listed = frozenset(islice(filter(keys.is_name, names), MAX_LISTED_CARS))
+        self._removed = (self._removed | frozenset(removed)) & self._cars.keys() - self._listed
 
     def on_message(self, name: str, topic: str, value: Any, now: float, wall_ns: int | None = None) -> None:
         """Handle a message of a car, as `CarView` does. If there is no place for the car, the message is ignored."""
@@ -357,8 +360,11 @@ class FleetView:
         self._make_room(MAX_OTHER_CARS, math.inf)  # some may not be listed any more
         for name, car in self._cars.items():
             car.on_presence(now, present=name in there)
-        for name in [each for each in self._cars if each.startswith(TEMPORARY_PREFIX) and each not in there]:
-            del self._cars[name]  # a car that blinked under this name, and has got a name of its own
+        # A car that blinked under a temporary name has got a name of its own, and so may a removed car have. Neither is
+        # lost: nobody shall look for it, or read at each STOP that it was not reached.
+        over = [each for each in self._cars if each.startswith(TEMPORARY_PREFIX) or each in self._removed]
+        for name in set(over) - there:
+            del self._cars[name]
 
     def as_list(self, now: float) -> list[dict[str, Any]]:
         """Return what a page shows of each car, by name."""

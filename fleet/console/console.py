@@ -66,6 +66,8 @@ KEPT_FOR_THIS_COMPUTER: Final = 8
 STOP_ANSWER_TIMEOUT_S: Final = 1.0
 """Timeout for the first answer to a STOP by POST. With fifty gateways on two busy cores, the last takes 0.11 s."""
 _MAX_EVENTS: Final = 4096
+_MAX_LISTS: Final = 16
+"""Number of `fleet up` whose cars are remembered."""
 _MAX_MERGES: Final = 256
 """Maximum number of remembered merges of stops, by sender and verb."""
 _MAX_STOP_IDS: Final = 256
@@ -101,6 +103,8 @@ class Console:
         """The colors of the cars in the running fleet. `fleet reload` may change them."""
         self.groups: Mapping[str, Sequence[str]] = {}
         """The cars of each group in the running fleet."""
+        self._lists: dict[str, frozenset[str]] = {}
+        """The cars that each `fleet up` has listed last, by its boot id. A fleet may have one on each computer."""
         self._unrecorded = ""
         """Why not everything is recorded, in the words of the running fleet."""
         self._replays: set[str] = set()
@@ -196,7 +200,11 @@ class Console:
         self.groups = groups_of(status)
         if colors := colors_of(status):
             self._colors = colors
-            self._view.list_cars(colors)
+            removed = self._lists.pop(status.boot_id, frozenset()) - colors.keys()
+            self._lists[status.boot_id] = frozenset(colors)
+            while len(self._lists) > _MAX_LISTS:
+                del self._lists[next(iter(self._lists))]
+            self._view.list_cars(colors, removed)
             self._view.update_colors()
 
     async def _renew_leases(self) -> None:

@@ -737,6 +737,35 @@ def test_stop_with_wrong_details_stops(stage: ServerStage, fields: dict[str, Any
     stage.person.ask(resume_request(), ["red"])
 
 
+def test_car_that_the_fleet_removed_is_not_lost(stage: ServerStage) -> None:
+    def says(boot_id: str, *cars: str) -> None:
+        status = pb.Supervision(boot_id=boot_id, colors=dict.fromkeys(cars, "#112233")).SerializeToString()
+        bus.put_again("fleet/@supervisor/status", status, encoding_of("fleet.v1.Supervision"), 0, Qos.STATE)
+
+    def until(shown: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        while not shown(cars := {car["name"]: car for car in next_message(page, "state")["cars"]}):
+            pass
+        return cars
+
+    with Bus.open(stage.fleet.endpoint) as bus, stage.device("viewer").socket() as page:
+        says("elsewhere", "black")
+        says("here", "red", "old", "gone")
+        tokens = [bus.token(car_token("fleet", name)) for name in ("old", "gone")]
+        until(lambda cars: all(cars.get(name, {}).get("gateway") for name in ("old", "gone")))
+        says("elsewhere", "black", "white")
+        says("here", "red", "gone", "new")  # `old` has another name now. Its gateway is still there
+        assert {"old", "gone"} <= set(until(lambda cars: True))
+        for token in tokens:
+            token.undeclare()
+        cars = until(lambda cars: "old" not in cars)
+        assert not until(lambda cars: not cars["gone"]["gateway"])["gone"]["gateway"], (
+            "nobody has removed it: it is lost"
+        )
+        assert cars["red"]["gateway"]
+        says("here", "red")
+        until(lambda cars: "gone" not in cars)
+
+
 def note_lease(sample: Sample, phases: list[str]) -> None:
     """Note the phase of a command for a lease."""
     event: Any = sample.message()
