@@ -26,7 +26,7 @@ from fleet.console.budgets import MAX_OPEN_COMMANDS, Budgets, StopMerge
 from fleet.console.bus_message import is_shown, message_in
 from fleet.console.car_view import MAX_OTHER_CARS, FleetView
 from fleet.console.connection_limit import LogLimit
-from fleet.console.hold_to_drive import TICK_INTERVAL_S, HeldPress, PressBook, PressRefused
+from fleet.console.hold_to_drive import TICK_INTERVAL_S, TOO_LATE, HeldPress, PressBook, PressRefused
 from fleet.console.inspect_feed import Inspections
 from fleet.console.lane_feed import LaneFeed
 from fleet.console.map_feed import MapFeed
@@ -125,7 +125,9 @@ class Console:
         self._pages: dict[int, PageLink] = {}
         self._last_page = 0
         self._readings: Latest[Sample] = Latest()
-        self.plan = PlanFeed(fleet, file, self.operator, self.sender_of, self.management_refusal, self._newest_samples)
+        self.plan = PlanFeed(
+            fleet, file, self.operator, self.sender_of, self.management_refusal, self._newest_samples, self._is_late
+        )
         self._plots = PlotFeed(fleet, self.operator.spawn)
         self._lanes = LaneFeed()
         self._map = MapFeed(self._view.has_place)
@@ -505,6 +507,8 @@ class Console:
         now = time.monotonic()
         self._end_presses_of_sleep()
         if message.is_command:
+            if message.kind != "give_back" and self._is_late(message):
+                raise BadPageMessage(TOO_LATE)
             cars = () if message.kind == Verb.UNPAUSE else message.cars()
             if words := self._command_refusal(page, cars, now):
                 raise BadPageMessage(words)
@@ -561,6 +565,13 @@ class Console:
             theirs = self._presses.drop_cars_of(set(cars), page.person.name, self._view.people_of(cars))
             self._end_all(theirs, "The car is in a mode.")
         self._count(page, page.operator.command(request, cars, answer))
+
+    def _is_late(self, message: PageMessage) -> bool:
+        """Return True if a page sent this message so long ago that nobody expects its effect any more.
+
+        A link that recovers delivers what was pressed while it hung. A message that names no tick has no age.
+        """
+        return "n" in message.fields and self._presses.is_late(message.number("n"), time.monotonic())
 
     def _command_refusal(self, page: PageLink, cars: Sequence[str], now: float) -> str:
         """Count a command to these cars. Return why it must not be sent, or an empty text if it may be."""

@@ -20,13 +20,20 @@ TICK_INTERVAL_S: Final = 0.1
 # no press ended by mistake.
 MAX_TICK_AGE_S: Final = 0.3
 """Maximum age of a tick when its echo arrives."""
+MAX_COMMAND_AGE_S: Final = 2.0
+"""Maximum age of a page's newest tick when a command of the page arrives. A gateway rejects a command of a client that
+is older, but knows only when the console has sent it."""
 MAX_ECHO_GAP_S: Final = 0.3
 """Maximum time without an echo. When it has passed, the press is over."""
 # After a stop, a gateway rejects a stream of drives until its sender has been silent. The added 0.1 s is one tick.
 AFTER_STOP_S: Final = STREAM_SILENCE_S + 0.1
 """Minimum time from a STOP to the next press."""
-_MAX_TICKS: Final = 16
-"""Number of remembered ticks. It is larger than the number of ticks within the maximum age."""
+_MAX_TICKS: Final = 32
+"""Number of remembered ticks. It is larger than the number of ticks within each maximum age."""
+
+
+TOO_LATE: Final = "Nothing was done: this reached the console more than 2 s after it was pressed. Press again."
+"""Answer to a command that is too old."""
 
 
 class PressRefused(Exception):
@@ -70,6 +77,10 @@ class PressBook:
         self._ticks[self._number] = now
         self._ticks.pop(self._number - _MAX_TICKS, None)
         return self._number
+
+    def is_late(self, tick: int, now: float) -> bool:
+        """Return True if a command that names this tick is too old to be carried out."""
+        return now - self._ticks.get(tick, float("-inf")) > MAX_COMMAND_AGE_S
 
     def begin(
         self,

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from fleet.aio import Fleet
 from fleet.console.bus_message import is_shown, message_in
+from fleet.console.hold_to_drive import TOO_LATE
 from fleet.console.operator import ConsoleOperator
 from fleet.console.page_feed import Handler, PageFeed
 from fleet.console.page_link import PageLink
@@ -31,7 +32,7 @@ class PlanFeed(PageFeed):
     """The plan in force, and who may change it. file: the fleet file. operator: the console's own operator.
 
     sender_of: returns the name under which a person acts. refusal: returns why a person may not manage plans. newest:
-    returns the newest messages of the cars, each with its age (s).
+    returns the newest messages of the cars, each with its age (s). is_late: returns True for a message that is too old.
     """
 
     def __init__(
@@ -42,12 +43,14 @@ class PlanFeed(PageFeed):
         sender_of: Callable[[PagePerson | None], str],
         refusal: Callable[[PagePerson | None], str],
         newest: Callable[[], Iterable[tuple[float, Sample]]],
+        is_late: Callable[[PageMessage], bool],
     ) -> None:
         self._fleet = fleet
         self._operator = operator
         self._sender_of = sender_of
         self._refusal = refusal
         self._newest = newest
+        self._is_late = is_late
         self.checks = PlanChecks(file)
         self._process = PlanProcess(fleet, file)
         self._coordinators: set[str] = set()
@@ -86,7 +89,8 @@ class PlanFeed(PageFeed):
 
     def _ask(self, page: PageLink, message: PageMessage) -> None:
         request_id, verb = message.number("id"), message.one_of("verb", frozenset(PlanRequest))
-        if words := self._refusal(page.person):
+        late = TOO_LATE if verb != PlanRequest.STOP and self._is_late(message) else ""
+        if words := self._refusal(page.person) or late:
             page.answer(t="plan_done", id=request_id, ok=False, words=words)
         else:
             page.operator.spawn(self._ask_coordinator(page, request_id, verb))

@@ -229,7 +229,7 @@ export function pauseAll(why) {
 export function unpause() {
   if (store.past !== null) return;
   verbs.set(++requestNumber, "unpause");
-  send({ t: "unpause", id: requestNumber });
+  send({ t: "unpause", id: requestNumber, n: tick });
 }
 
 // ---------------------------------------------------------------- hold to drive
@@ -286,16 +286,17 @@ document.addEventListener("visibilitychange", () => {
 
 // ---------------------------------------------------------------- commands
 
+// Each command names the newest tick. By it the console knows how old the command is when a slow link has delivered it.
 export function command(verb, cars, fields = {}) {
   if (cars.length === 0 || (store.past !== null && !STOPS.includes(verb))) return;
   verbs.set(++requestNumber, verb);
-  send({ t: "do", id: requestNumber, verb, cars, ...fields });
+  send({ t: "do", id: requestNumber, n: tick, verb, cars, ...fields });
 }
 
 export function lease(kind, cars) {
   if (store.past !== null) return;
   verbs.set(++requestNumber, kind === "take" ? "lease" : "release");
-  send({ t: kind, id: requestNumber, cars });
+  send({ t: kind, id: requestNumber, n: tick, cars });
 }
 
 // What pages show beside the cars: a page registers a handler for messages of the console with this `t`. The page is
@@ -306,7 +307,7 @@ export function on(kind, handler) {
 }
 
 export function askBySocket(kind, fields) {
-  send({ t: kind, id: ++requestNumber, ...fields });
+  send({ t: kind, id: ++requestNumber, n: tick, ...fields });
   return requestNumber;
 }
 

@@ -766,6 +766,37 @@ def test_car_that_the_fleet_removed_is_not_lost(stage: ServerStage) -> None:
         until(lambda cars: "gone" not in cars)
 
 
+LATE_TICKS = 30
+"""Ticks after which a command is too late: one and a half times as many as in its maximum age."""
+
+
+def test_late_command_starts_nothing_and_late_stop_stops(stage: ServerStage) -> None:
+    stage.person.ask(resume_request(), ["red"])
+    orders: list[dict[str, Any]] = [
+        {"t": "do", "verb": "mode", "cars": ["red"], "mode": "tracking"},
+        {"t": "do", "verb": "resume", "cars": ["red"]},
+        {"t": "take", "cars": ["red"]},
+        {"t": "unpause"},
+    ]
+    with stage.device("mia").socket() as page:
+        old = next_message(page, "tick")["n"]
+        while next_message(page, "tick")["n"] < old + LATE_TICKS:
+            pass
+        for number, order in enumerate(orders):
+            page.send(json.dumps({**order, "id": number, "n": old}))
+            assert "Press again" in next_message(page, "bad")["words"]
+        page.send(
+            json.dumps({"t": "do", "verb": "whistle", "cars": ["red"], "id": 9, "n": next_message(page, "tick")["n"]})
+        )
+        assert next_message(page, "done")["outcomes"][0]["ok"]
+        assert stage.fleet.state("mode").asked == "manual"
+        assert not stage.fleet.state("safety").HasField("lease")
+        stage.drive()
+        page.send(json.dumps({"t": "do", "verb": "stop", "cars": ["red"], "id": 10, "n": old}))
+        wait_for(lambda: not stage.judge.driving, "red stands")
+    stage.person.ask(resume_request(), ["red"])
+
+
 def note_lease(sample: Sample, phases: list[str]) -> None:
     """Note the phase of a command for a lease."""
     event: Any = sample.message()
