@@ -749,11 +749,11 @@ def test_car_that_the_fleet_removed_is_not_lost(stage: ServerStage) -> None:
 
     with Bus.open(stage.fleet.endpoint) as bus, stage.device("viewer").socket() as page:
         says("elsewhere", "black")
-        says("here", "red", "old", "gone")
+        says("here", "first", "old", "gone")
         tokens = [bus.token(car_token("fleet", name)) for name in ("old", "gone")]
         until(lambda cars: all(cars.get(name, {}).get("gateway") for name in ("old", "gone")))
         says("elsewhere", "black", "white")
-        says("here", "red", "gone", "new")  # `old` has another name now. Its gateway is still there
+        says("here", "first", "gone", "new")  # `old` has another name now. Its gateway is still there
         assert {"old", "gone"} <= set(until(lambda cars: True))
         for token in tokens:
             token.undeclare()
@@ -762,7 +762,7 @@ def test_car_that_the_fleet_removed_is_not_lost(stage: ServerStage) -> None:
             "nobody has removed it: it is lost"
         )
         assert cars["red"]["gateway"]
-        says("here", "red")
+        says("here", "first")
         until(lambda cars: "gone" not in cars)
 
 
