@@ -27,6 +27,7 @@ from fleet.client.commands import stop_request
 from fleet.console.budgets import TOO_MANY_PLANS, TOO_MUCH, page_budget
 from fleet.console.console import Console, TooManyPages
 from fleet.console.fair_socket import FairWebSocket
+from fleet.console.hold_to_drive import TOO_LATE
 from fleet.console.log_rate import LogRate
 from fleet.console.page_requests import is_stop
 from fleet.console.people_book import PagePerson
@@ -242,6 +243,8 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         person = request.scope.get(PERSON)
         if words := console.management_refusal(person):
             return JSONResponse({"ok": False, "words": words}, 403)
+        if console.is_late(request.query_params.get("n", "")):
+            return JSONResponse({"ok": False, "words": TOO_LATE}, 408)
         return await _answer_plan(request, console, console.plan.set_plan)
 
     async def connect(socket_: WebSocket) -> None:

@@ -394,6 +394,7 @@ function onMessage(text) {
   changed();
 }
 
+export const newestTick = () => tick;
 const tickListeners = new Set();
 export function onTick(listener) {
   tickListeners.add(listener);

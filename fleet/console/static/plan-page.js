@@ -1,6 +1,6 @@
 // The plan page: the plan in force, who has which role and why, and another plan.
 
-import { ask, askBySocket, changed, clock, on, store, who } from "./console.js";
+import { ask, askBySocket, changed, clock, newestTick, on, store, who } from "./console.js";
 import { seen } from "./foreign.js";
 import { need } from "./past.js";
 import { countsWith, withRoles } from "./plan-text.js";
@@ -27,7 +27,7 @@ async function sendPlan(what, text) {
   tried = null;
   answer = { ok: true, words: t.working };
   changed();
-  answer = await ask(`/plan/${what}`, text);
+  answer = await ask(`/plan/${what}?n=${newestTick()}`, text);
   tried = what === "check" ? text : null;
   changed();
   return answer;

@@ -785,6 +785,9 @@ def test_late_command_starts_nothing_and_late_stop_stops(stage: ServerStage) -> 
         for number, order in enumerate(orders):
             page.send(json.dumps({**order, "id": number, "n": old}))
             assert "Press again" in next_message(page, "bad")["words"]
+        teacher = stage.device("teacher", "--rank", "lead")
+        status, text = teacher.ask("POST", f"/plan/set?n={old}", "roles:\n  guide: {mode: tracking}\n")
+        assert (status, "Press again" in json.loads(text)["words"]) == (408, True)
         page.send(
             json.dumps({"t": "do", "verb": "whistle", "cars": ["red"], "id": 9, "n": next_message(page, "tick")["n"]})
         )
