@@ -367,6 +367,33 @@ def test_stop_is_repeated_until_console_is_back(stage: ConsoleStage) -> None:
         stage.stands(car)
 
 
+@pytest.mark.parametrize("what", ["estop", "pause"])
+def test_estop_and_pause_are_sent_again_when_console_is_back(stage: ConsoleStage, what: str) -> None:
+    page, errors = stage.page(), list[str]()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.locator("[data-car=red]").wait_for()
+    stage.console.process.kill()
+    stage.console.process.wait()
+    page.get_by_text("The console does not answer").wait_for()
+    drive_all(stage)
+    page.locator(f"#{what}").click()
+    page.locator("input[name=why]").fill("smoke")
+    page.locator("input[name=why]").press("Enter")
+    page.get_by_text(f"{'E-stop' if what == 'estop' else 'pause'} has not reached the console").wait_for()
+    stage.console = ConsoleProcess(stage.fleet, port=stage.console.port)
+    page.get_by_text("has not reached the console").wait_for(state="hidden")
+    for car in CARS:
+        stage.stands(car)
+        safety = wait_for(
+            lambda car=car: (found := stage.fleet.state("safety", car)) and (found.estops or found.pauses) and found,
+            car,
+        )
+        assert [each.why for each in (safety.estops if what == "estop" else safety.pauses)] == ["smoke"]
+    if what == "pause":
+        stage.person.unpause()
+    assert errors == []
+
+
 def test_stops_wait_for_no_gateway_that_hangs(stage: ConsoleStage) -> None:
     page = stage.page()
     stage.gateways["red"].popen.send_signal(signal.SIGSTOP)

@@ -1,6 +1,6 @@
 // The page: navigation, the STOP bar in the same place on every page, and the keys that stop.
 
-import { carsInPlace, changed, clock, estopAll, isReady, pauseAll, setTexts, stopAll, store, subscribe, unpause, when, who } from "./console.js";
+import { carsInPlace, changed, clock, estopAll, isReady, pauseAll, setTexts, stopAll, store, subscribe, unpause, unsentStop, when, who } from "./console.js";
 import { goLive, jump, route } from "./past.js";
 import { DrivePage } from "./drive-page.js";
 import { FleetPage } from "./fleet-page.js";
@@ -287,7 +287,8 @@ class App extends Component {
       <div class="messages"><div class="notices">
         ${isReady() && html`<${PastBar} />`}
         ${state !== null && (store.lost || !store.connected) && !store.unpaired && html`<${Banner} words=${t.consoleLost(store.refusedWhy)} />`}
-        ${store.stopUnsent && html`<${Banner} words=${t.stopUnsent} />`}
+        ${store.stopUnsent && unsentStop() !== "estop" && html`<${Banner} words=${t.stopUnsent} />`}
+        ${unsentStop() && html`<${Banner} words=${t.unsentStops[unsentStop()]} />`}
         ${store.unpaired && html`<p class="banner" role="alert">${t.unpaired[store.unpaired]} <a href="/pair">${t.pairAgain}</a></p>`}
         ${state !== null && !state.hub && html`<${Banner} words=${t.hubLost} />`}
         ${isReady() && isGuest() && html`<p class="note guest" role="status" data-guest>${t.guest(store.hello.person.name)}</p>`}

@@ -154,10 +154,31 @@ async function postStop(id, until) {
 
 export function estopAll(why) {
   if (!store.connected || store.lost) stopAll(); // a stop also goes by fetch, again and again
-  send({ t: "estop", id: newId(), why });
+  stopFor("estop", why);
+}
+
+export const pauseAll = (why) => stopFor("pause", why);
+
+// An e-stop or a pause goes over the socket. If that breaks before the console has begun the stop, the next socket gets
+// the message again. The console acts once.
+let latched = null; // {message, at_ms, until}: the newest one, until the console has begun it
+function stopFor(t, why) {
+  latched = { message: { t, id: newId(), why }, at_ms: consoleNow(), until: performance.now() + STOP_RETRY_MS };
+  send(latched.message);
   letGo();
   changed();
 }
+
+function sendLatched() {
+  if (latched !== null && performance.now() < latched.until) send(latched.message);
+}
+
+function noteLatched({ stop }) {
+  if (latched !== null && stop?.verb === latched.message.t && stop.at_ms >= latched.at_ms) latched = null;
+}
+
+// "estop" or "pause": somebody has pressed it, and it has not reached the console. Else empty.
+export const unsentStop = () => (latched !== null && (!store.connected || store.lost || performance.now() > latched.until) ? latched.message.t : "");
 
 // ---------------------------------------------------------------- who may do what
 
@@ -218,12 +239,6 @@ export function carsInPlace() {
   const cars = new Map(shownCars().map((car) => [car.name, car]));
   store.places = placed(store.places, [...cars.keys()], isShared([...cars.keys()]) ? isMine : () => false);
   return store.places.filter((name) => cars.has(name)).map((name) => cars.get(name));
-}
-
-export function pauseAll(why) {
-  send({ t: "pause", id: newId(), why });
-  letGo();
-  changed();
 }
 
 export function unpause() {
@@ -355,6 +370,7 @@ function onMessage(text) {
     case "state":
       store.state = message;
       stateAt = lastMessageAt;
+      noteLatched(message);
       stateChanged();
       return;
     case "rights":
@@ -386,6 +402,7 @@ function onMessage(text) {
       break;
     }
     case "bad":
+      if (latched?.message.t === "pause") latched = null; // it may have been refused
       note(message.words, true);
       break;
     default:
@@ -423,6 +440,7 @@ async function connect() {
     store.connected = true;
     store.refusedWhy = "";
     pressNumber = 0;
+    sendLatched();
     for (const message of wishes.values()) send(message);
     changed();
   };

@@ -123,6 +123,10 @@ export const t = {
   inTerminal: (words) => words.replace("Type: ", "In a terminal on the computer of the console, type: "),
   hubLost: "The console has lost the bus. What the cards show is old, and a STOP may not arrive: look at the cars.",
   unrecorded: (why) => `Nothing is recorded: ${why}`,
+  unsentStops: {
+    estop: "The E-stop has not reached the console. Go to the cars, or type `fleet estop` in a terminal.",
+    pause: "The pause has not reached the console. Press Pause again, or type `fleet pause` in a terminal.",
+  },
   stopUnsent: "STOP has not reached the console. Go to the cars, or type `fleet stop` in a terminal.",
   stop: "STOP all cars",
   stopKeys: "Escape, or Space",
