@@ -103,6 +103,17 @@ def test_example_is_changed_in_the_form_and_tried(stage: ConsoleStage) -> None:
         re.compile("no role → (patrol|guide|lamp)")
     )
     assert serious(page) == []
+    written = area.input_value()
+    page.locator("nav a[href='#/']").click()
+    page.locator("[data-car=red]").wait_for()
+    page.locator("nav a[href='#/plan']").click()
+    expect(area).to_have_value(written)
+    expect(page.locator("[data-form-role]")).to_have_count(len(plan.roles))
+    expect(page.locator("[data-try]")).to_have_count(3)
+    page.reload()
+    expect(area).to_have_value(written)
+    page.locator("[data-plan=check]").click()
+    expect(page.locator("[data-try]")).to_have_count(3)
     area.fill(f"{area.input_value()}#\n")
     expect(page.locator("[data-trial]")).to_have_count(0)
     assert page.locator("[data-plan=set]").is_disabled(), "another text was tried"

@@ -16,6 +16,24 @@ on("plan_done", (message) => {
   answer = message;
 });
 let tried = null; // the text that the answer is about, if it was checked
+// The plan that is being written, as text, and as roles while they are in a form. Somebody who looks at another page finds it
+// again. A page that is loaded again (phones do that with a page that slept) has the text.
+const DRAFT = "fleet-plan-draft";
+let draft = { text: remembered(), form: null };
+function remembered() {
+  try {
+    return sessionStorage.getItem(DRAFT) ?? "";
+  } catch {
+    return ""; // a browser that keeps nothing
+  }
+}
+function remember(fields) {
+  draft = { ...draft, ...fields };
+  try {
+    sessionStorage.setItem(DRAFT, draft.text);
+  } catch {}
+  return draft;
+}
 
 const request = (verb) => {
   tried = null;
@@ -159,17 +177,15 @@ function RolesForm({ roles, onChange }) {
 }
 
 function Editor({ current }) {
-  const [text, setText] = useState("");
+  const [{ text, form }, setDraft] = useState(draft);
   const [examples, setExamples] = useState([]);
-  const [form, setForm] = useState(null); // the roles, while they are in a form
   const area = useRef(null);
   useEffect(() => {
     ask("/plan/examples").then((found) => setExamples(found.examples ?? []));
   }, []);
-  const take = (words) => {
-    setText(words);
-    setForm(null);
-  };
+  const change = (fields) => setDraft(remember(fields));
+  const setForm = (roles) => change({ form: roles });
+  const take = (words) => change({ text: words, form: null });
   // Select the line of a fault in the text.
   const show = (line) => {
     const lines = text.split("\n");
@@ -191,10 +207,7 @@ function Editor({ current }) {
     const found = await sendPlan("check", text);
     if (found.roles) setForm(found.roles);
   };
-  const write = (roles) => {
-    setForm(roles);
-    setText(withRoles(text, roles));
-  };
+  const write = (roles) => change({ text: withRoles(text, roles), form: roles });
   const refused = store.rights.manage;
   const isTried = tried !== null && tried === text && answer.ok;
   return html`<section>
