@@ -73,6 +73,14 @@ class FairWebSocket(WebSocketsSansIOProtocol):
         # against the limit of open connections for ever.
         if message["type"] == "websocket.close":
             self._end_later()
+            self._drop_messages()
+
+    def _drop_messages(self) -> None:
+        """Drop the messages before the closing: nobody takes them any more, and the page's answer waits behind them."""
+        while not self.queue.empty():
+            self.queue.get_nowait()
+        if not self._waits:
+            self._parse()
 
     def handle_close(self, event: Frame) -> None:
         """Answer when the page closes the WebSocket, and make sure that the connection ends."""

@@ -477,6 +477,26 @@ def test_revoked_device_is_disconnected_at_once(stage: ServerStage, how: str) ->
     stage.run("people", "--revoke", "teacher")
 
 
+MAX_CLOSING_S = 0.5
+"""Maximum time for which a closed page still looks live. The client of the test itself waits for 1 s at most."""
+
+
+def test_page_is_closed_at_once_with_messages_behind(stage: ServerStage) -> None:
+    """The page says that it is live until its connection has ended, as after a revocation while it drives."""
+    times = []
+    for _ in range(3):  # a busy machine may delay one of them
+        with stage.device("calm").socket() as page:
+            next_message(page, "rights")
+            began = time.monotonic()
+            with page.send_context():  # all at once
+                page.protocol.send_binary(b"closes the page")
+                for _ in range(5):
+                    page.protocol.send_text(b'{"t":"echo","n":1,"press":1}')
+            read_to_the_end(page)
+            times.append(time.monotonic() - began)
+    assert min(times) < MAX_CLOSING_S, times
+
+
 def read_to_the_end(page: ClientConnection) -> None:
     """Read until the console closes the socket."""
     with contextlib.suppress(ConnectionClosed):
