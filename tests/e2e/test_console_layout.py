@@ -302,7 +302,7 @@ def test_selection_outlives_a_reload_but_not_its_tab(stage: ConsoleStage) -> Non
     expect(page.locator("input[name=select-red]")).to_be_checked()
     expect(page.locator("input[name=select-green]")).not_to_be_checked()
     with stage.held(page, "forward"):
-        pass
+        expect(page.locator("[data-live=red] .live-state")).to_contain_text("you drive ·")
     stage.stands()
     other = page.context.new_page()
     other.goto(page.url)

@@ -373,7 +373,7 @@ export const t = {
   lookAt: "Look at it",
   board: "Board",
   boardFull: "Fill the screen",
-  boardHolds: (name) => `${name} has it`,
+  boardHolds: (name) => (name === t.you ? "you have it" : `${name} has it`),
   boardFree: "free",
   boardItself: "drives itself",
   boardHeld: (by) => `stopped by ${by}`,
@@ -487,7 +487,7 @@ export const t = {
   isMoving: "moving",
   holdMark: "on hold",
   lentMark: (to) => `lent to ${to}`,
-  drivenMark: (who) => `${who} drives`,
+  drivenMark: (who) => (who === t.you ? "you drive" : `${who} drives`),
   troubles: {
     unconfirmed: "STOP NOT CONFIRMED",
     lost: "LOST",
