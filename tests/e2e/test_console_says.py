@@ -268,22 +268,22 @@ def test_wifi_that_breaks_while_two_keys_are_held_ends_both(stage: ConsoleStage)
 
 
 def test_mode_and_take_over_pressed_in_dead_wifi_do_nothing_when_it_is_back(stage: ConsoleStage) -> None:
-    page = stage.driving_page("red", wired=True)
+    page = stage.driving_page("blue", wired=True)
     stage.wire.cut()
     try:
         expect(page.locator(".banner")).to_contain_text("The console does not answer")
         page.locator("[data-mode=tracking]").click()
-        page.get_by_label("Take over red").click()
+        page.get_by_label("Take over blue").click()
         page.wait_for_timeout(2500)  # not a wait: the test is about this time
     finally:
         stage.wire.mend()
     expect(page.locator(".results")).to_contain_text("Press again")
     page.locator("[data-do=whistle]").click()  # it comes after both
     expect(page.locator(".results")).to_contain_text("whistle", ignore_case=True)
-    assert stage.fleet.state("mode").asked == "manual"
-    assert not stage.fleet.state("safety").HasField("lease")
-    page.locator("[data-mode=tracking]").click()
-    wait_for(lambda: stage.fleet.state("mode").asked == "tracking", "pressed again, it tracks")
+    assert stage.fleet.state("mode", "blue").asked == "manual"
+    assert not stage.fleet.state("safety", "blue").HasField("lease")
+    page.locator("[data-mode=color_led]").click()  # no car leaves its place
+    wait_for(lambda: stage.fleet.state("mode", "blue").asked == "color_led", "pressed again, it changes its mode")
 
 
 def test_sleeping_phone_stops_car_and_wakes_without_driving(stage: ConsoleStage) -> None:
