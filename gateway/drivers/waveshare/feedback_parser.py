@@ -18,8 +18,6 @@ FEEDBACK: Final = 1001
 """Value of `T` in a feedback."""
 MAX_M_S: Final = 5.0
 """Maximum speed of a wheel. A greater number is not a measurement."""
-MAX_DEG: Final = 360.0
-"""Maximum angle. A greater number is not a measurement: without a checksum, a lost decimal point makes one."""
 _IMU: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 _OF_ARM: Final = frozenset({"torB", "torS", "torE", "torH"})
 """Fields that only a car with an arm sends. Such a car sends positions of the arm in the fields of the yaw or the
@@ -64,9 +62,8 @@ def read_line(line: bytes, at: float) -> list[Event]:
             found, place = _DECODER.raw_decode(text, start)
         except (ValueError, RecursionError):
             # A truncated object and a whole one can share a line, so look on after the truncated one.
-            place = text.find("{", start + 1)
-            if place < 0:
-                place = len(text)
+            following = text.find("{", start + 1)
+            place = following if following >= 0 else len(text)
             events.append(Rejected(text[start:place].encode("latin-1"), at, Cause.TRUNCATED))
             continue
         events.append(_event(found, text[start:place].encode("latin-1"), at))
@@ -84,7 +81,10 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
     firmware = firmware_of(found, _number(found, "v") or 0.0)
     has_arm = not _OF_ARM.isdisjoint(found)
     has_attitude = firmware is UgvFirmware.GENERAL and not has_arm
-    attitude = _attitude(_tuple(found, ("r", "p", "y"), 1.0)) if has_attitude else None
+    attitude = _tuple(found, ("r", "p", "y"), math.radians(1.0)) if has_attitude else None
+    if attitude is not None:  # more than a turn is no measurement: without a checksum, a lost point makes such a number
+        is_angle = max(map(abs, attitude)) <= math.tau
+        attitude = tuple(math.remainder(each, math.tau) for each in attitude) if is_angle else None
     odometer = _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None
     imu = _tuple(found, _IMU, 1.0) if firmware is UgvFirmware.ROS and not has_arm else None
     return Feedback(raw, at, firmware, left, right, _voltage(found, firmware), attitude, odometer, imu)
@@ -92,19 +92,8 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
 
 def _voltage(found: dict[str, Any], firmware: UgvFirmware | None) -> float | None:
     """Return the voltage, V. GENERAL sends volts, ROS hundredths of a volt."""
-    value = _number(found, "v")
-    if value is None or firmware is None:
-        return None
-    volts = value if firmware is UgvFirmware.GENERAL else value / 100
-    return volts if 0.0 < volts <= MAX_V else None
-
-
-def _attitude(angles_deg: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-    """Return the angles in rad, -pi..pi. None if one of them is not an angle. A program may count to 360 degrees."""
-    if angles_deg is None or max(map(abs, angles_deg)) > MAX_DEG:
-        return None
-    roll, pitch, yaw = (math.remainder(math.radians(each), math.tau) for each in angles_deg)
-    return roll, pitch, yaw
+    volts = (_number(found, "v") or 0.0) / (100 if firmware is UgvFirmware.ROS else 1)
+    return volts if firmware is not None and 0.0 < volts <= MAX_V else None
 
 
 def _tuple(found: dict[str, Any], names: tuple[str, ...], unit: float) -> Any:
@@ -114,6 +103,6 @@ def _tuple(found: dict[str, Any], names: tuple[str, ...], unit: float) -> Any:
 
 def _number(found: dict[str, Any], name: str) -> float | None:
     value = found.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # also rejects NaN
-        return None
-    return float(value)
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9:  # also rejects NaN
+        return float(value)
+    return None
