@@ -417,7 +417,7 @@ def test_page_that_was_cut_off_or_frozen_says_so_and_is_live_again(how: str, vie
 
 def test_car_that_does_not_stop_is_said_to_be_so_on_each_page(stage: ConsoleStage) -> None:
     page = stage.page()
-    stage.person.car("red").mode("tracking").check()
+    stage.person.car("red").mode("obstacle_avoidance").check()
     wait_for(lambda: stage.judges["red"].driving, "red drives")
     stage.sim.say({"car": "red", "fault": "deaf", "for_s": 120})
     try:
