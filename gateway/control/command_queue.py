@@ -33,6 +33,8 @@ class HeldMotion(Struct):
     If the drive continues the same motion of another sender without a frame: when it was accepted."""
     range_cm: float | None = None
     """The last distance (in cm) that was measured before that frame was written. None if it is not known."""
+    waited_for: str = ""
+    """What else than other commands had to be done before that frame, in words. Empty if nothing."""
 
     @property
     def sender(self) -> Sender:

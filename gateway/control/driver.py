@@ -573,7 +573,7 @@ class Driver(ABC):
                 words = ""
                 if held.began_at is not None and held.began_at > held.pending.received_at + LATE_DRIVE_S:
                     waited_s = held.began_at - held.pending.received_at
-                    words = f"began after {waited_s:.1f} s: {car} was busy"
+                    words = f"began after {waited_s:.1f} s: {held.waited_for or f'{car} was busy'}"
                 self.release(Phase.COMPLETE, None, words, now)
             else:  # the frame of the drive could not be written in all that time
                 waited_s, waits = now - held.pending.received_at, self.wait_words(now)

@@ -53,8 +53,6 @@ class Executor(Driver):
         """When the frames of the last actions on parts of the car were written."""
         self._speeds_before_step: Speeds | None = None
         """The speeds before the last frame, if that was a step of the speed."""
-        self._lowered: Pending | None = None
-        """The last drive before which the speed was lowered."""
 
     @property
     def model(self) -> CarModel:
@@ -394,12 +392,10 @@ class Executor(Driver):
             case StopInProgress():
                 self._step_written(source, now)
             case HeldMotion() if isinstance(frame, General) and frame.speed is not None:
-                self._lowered = source.pending
+                source.waited_for = f"its speed was lowered to {model.believed.share:.0%} first (speed_max)"
             case HeldMotion():
                 source.begin(now, model.range_cm)
-                lowered = self._lowered is source.pending
-                words = f"its speed was lowered to {model.believed.share:.0%} first (speed_max)" if lowered else ""
-                self._log.record_sent(source.pending, now, words)
+                self._log.record_sent(source.pending, now, source.waited_for)
             case Pending() if source is self.queue.mode_change:
                 self.queue.mode_change = None
                 self.mode_sent = (source, now)

@@ -68,7 +68,8 @@ def test_drive_begins_after_the_steps_down_that_it_needs(platform: str, speed_ma
     down = sum(b"0,0,0,2,0" in frame for _, frame in pair.sent[sent:])
     assert down == steps
     assert ("speed_max" in pair.records[-1].words) is (steps > 0)
-    pair.run(0.5)
+    pair.run(3.0)
+    assert ("speed_max" in pair.records[-1].words) is ("began after" in pair.records[-1].words)
     assert 0.0 < _share(pair, 0.0) <= speed_max
 
 
