@@ -1,5 +1,6 @@
 """Waits until a condition holds for a reading, or has held for some time. Pure: readings and time are arguments."""
 
+import math
 from datetime import UTC, datetime, timedelta
 from typing import Final
 
@@ -39,6 +40,9 @@ class ConditionWait:
     """A wait for one condition. `for_s` is the minimum time for which it must hold, by the readings' stamps."""
 
     def __init__(self, condition: KeyCondition, for_s: float = 0.0) -> None:
+        """Begin to wait. Raises ValueError if `for_s` is no time: with NaN, the wait would never end."""
+        if not 0.0 <= for_s < math.inf:
+            raise ValueError(f"for_s {for_s} is not allowed: write a number of seconds from 0, such as 2.0")
         self._condition = condition
         self._for_s = for_s
         self._seen: dict[str, _LastReading] = {}

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import json
+import math
 import os
 import pty
 import re
@@ -330,6 +331,12 @@ def ends(waiting: ConditionWait, seen: list[tuple[float, float | None]], end_s: 
         taken = reading("sensor/range", number, end_s - at, range_m=range_m)
         found.append(waiting.ends(taken, taken.time))
     return found
+
+
+@pytest.mark.parametrize("for_s", [math.nan, math.inf, -1.0])
+def test_wait_for_what_is_no_time(for_s: float) -> None:
+    with pytest.raises(ValueError, match="for_s"):
+        close(for_s)
 
 
 @pytest.mark.parametrize(
