@@ -53,7 +53,7 @@ def test_setup_finds_car_blinks_and_keeps_comments(stage: ConsoleStage, file: Pa
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.dataset.setup") == "write"
     page.keyboard.press("Enter")
-    page.get_by_text("fleet.yaml has ann.").wait_for()
+    page.get_by_text("fleet.yaml now has ann.").wait_for()
     text = file.read_text()
     assert text.startswith("# the cars of our lab\n")
     assert "# without a link yet" in text
