@@ -213,7 +213,7 @@ class Coordinator:
         for command, outcome in self._commands.outcomes():
             assert command.mode is not None
             refusal = None if outcome.ok else Refusal(command.mode, outcome.reason, outcome.words, now)
-            observer.on_outcome(command.car, refusal)
+            observer.on_outcome(command.car, command.mode, refusal)
         observer.forget(now, {*self.plan.named_cars, *self._memory.held_roles, *self._commands.busy})
         result = step(self.plan, observer.snapshot(self._commands.busy), self._memory, now)
         before, self._memory = self._memory, result.memory

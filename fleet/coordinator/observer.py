@@ -106,10 +106,10 @@ class FleetObserver(Struct):
         for state in self.states.values():
             state.on_sleep(slept_s)
 
-    def on_outcome(self, car: str, refusal: Refusal | None) -> None:
-        """Note the refusal of a command. None means that the command succeeded."""
+    def on_outcome(self, car: str, mode: str, refusal: Refusal | None) -> None:
+        """Note the outcome of a command for a mode. `refusal` is None if the command succeeded."""
         if car in self.cars:
-            self.cars[car] = replace(self.cars[car], refused=refusal)
+            self.cars[car] = self.cars[car].with_outcome(mode, refusal)
 
     def on_sample(self, sample: Sample, now: float, wall_s: float | None) -> None:
         """Add a message.

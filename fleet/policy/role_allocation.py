@@ -137,13 +137,8 @@ def find_barrier(known: CarSnapshot, role: Role, now: float) -> Barrier | None:
     missing = sorted(role.capabilities - known.capabilities)
     if missing:
         return Barrier(f"it cannot {', '.join(missing)}", "it becomes able to")
-    refused = known.refused
-    if (
-        refused is not None
-        and refused.mode == role.mode
-        and refused.reason in _REFUSALS
-        and now - refused.at < REFUSED_MODE_RETRY_S
-    ):
+    refused = known.refusal_of(role.mode)
+    if refused is not None and refused.reason in _REFUSALS and now - refused.at < REFUSED_MODE_RETRY_S:
         return Barrier(
             f"it refused mode {refused.mode}: {refused.reason}: {refused.words}",
             "it accepts the mode at the next request, after 10 s",

@@ -141,6 +141,9 @@ class CarSnapshot(Struct, frozen=True):
     listed: bool = False
     """True if the fleet file lists the car."""
     refused: Refusal | None = None
+    """The refusal of the last mode command. None if that command was carried out."""
+    refused_before: tuple[Refusal, ...] = ()
+    """The refusals of other modes, which the car has not accepted since."""
     busy: bool = False
     """True if a mode command to the car has no outcome yet."""
 
@@ -153,6 +156,20 @@ class CarSnapshot(Struct, frozen=True):
     def profile(self) -> CarProfile | None:
         """The profile of the car's platform, or None if the platform is not known."""
         return _profile(self.platform)
+
+    def with_outcome(self, mode: str, refusal: Refusal | None) -> "CarSnapshot":
+        """Return the car after the outcome of a command for this mode. `refusal` is None if it was carried out."""
+        before = [each for each in (self.refused, *self.refused_before) if each is not None and each.mode != mode]
+        if refusal is not None:
+            # A car that refuses again, such as for its battery, would still refuse the modes that it has refused
+            # before. If these were tried again one by one, a role would move from car to car each time.
+            before = [replace(each, at=refusal.at) for each in before]
+        return replace(self, refused=refusal, refused_before=tuple(before))
+
+    def refusal_of(self, mode: str) -> Refusal | None:
+        """Return the last refusal of this mode. None if the car has accepted the mode since."""
+        refusals = (self.refused, *self.refused_before)
+        return next((each for each in refusals if each is not None and each.mode == mode), None)
 
     def lacks(self, mode: str) -> bool:
         """Return True if the car's platform does not know this mode, or the fleet file forbids it."""

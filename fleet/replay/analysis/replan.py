@@ -142,7 +142,7 @@ class Replanning:
             self._busy[key.car] = request.mode
         elif event.phase in _FINAL_PHASES and (mode := self._busy.pop(key.car, None)) is not None:
             refusal = Refusal(mode, event.reason, event.words, item.recorded_ns / 1e9)
-            self._observer.on_outcome(key.car, None if event.phase in _SUCCESS_PHASES else refusal)
+            self._observer.on_outcome(key.car, mode, None if event.phase in _SUCCESS_PHASES else refusal)
 
     def _advance(self, to_ns: int) -> None:
         """Advance the clock, with a step at each interval."""

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from fleet.policy.decide import DecisionStep, step
 from fleet.policy.plan.plan import Plan
-from fleet.policy.snapshot import CarSnapshot, FleetSnapshot
+from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from fleet.policy.state import PolicyState
 from schemas import messages, topics
 from schemas.messages import Observation
@@ -38,6 +38,10 @@ class PolicyRun:
 
     def change(self, car: str, **fields: Any) -> None:
         self.cars[car] = replace(self.cars[car], **fields)
+
+    def refuse(self, car: str, mode: str, reason: str) -> None:
+        """Let the last command of a car have been refused."""
+        self.cars[car] = self.cars[car].with_outcome(mode, Refusal(mode, reason, "", self.now))
 
     def sees(self, car: str, **topics: dict[str, Any]) -> None:
         self.readings[car] = {**self.readings.get(car, {}), **seen(self.now, **topics)}

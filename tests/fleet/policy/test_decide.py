@@ -184,6 +184,41 @@ def test_role_goes_to_another_car_after_refusal() -> None:
     assert run.roles == {"red": "scout"}
 
 
+def test_car_that_refuses_every_mode_does_not_make_others_change_roles() -> None:
+    """Both cars changed roles ten times a second: only the last refusal was known, so each role was tried again."""
+    run = PolicyRun(parse("roles: {patrol: {mode: obstacle_avoidance}, guide: {mode: tracking}}"), "blue", "red")
+    run.change("red", mode="obstacle_avoidance")
+    run.obey = False
+    for _ in range(600):
+        before = len(run.asked)
+        run.until(run.now + 0.1)
+        for _, car, mode in run.asked[before:]:
+            if car == "blue":
+                run.refuse(car, mode, "battery_low")
+            else:
+                run.change(car, mode=mode, verdict="assumed")
+    changes = [mode for _, car, mode in run.asked if car == "red"]
+    assert len(changes) <= 1, "only the first refusal shows that red has to take the other role"
+    assert list(run.roles) == ["red"]
+    assert len([car for _, car, _ in run.asked if car == "blue"]) <= 8, "it is tried again each 10 s"
+    blue = run.of("blue").why
+    assert "battery_low" in blue
+
+
+def test_car_that_accepts_again_gets_its_role_after_refusals() -> None:
+    run = PolicyRun(parse("roles: {patrol: {mode: obstacle_avoidance}, guide: {mode: tracking}}"), "blue", obey=False)
+    run.at(0.0)
+    run.refuse("blue", "obstacle_avoidance", "link_down")
+    run.at(0.1)
+    run.refuse("blue", "tracking", "link_down")
+    run.until(10.0)
+    assert run.roles == {}
+    run.obey = True
+    run.until(10.3)
+    assert run.roles == {"blue": "patrol"}
+    assert run.cars["blue"].with_outcome("tracking", None).refusal_of("tracking") is None
+
+
 def test_leader_sees_lamp_and_keeps_role_during_mode_change() -> None:
     run = PolicyRun(LAMP, "blue", "green", "red")
     for car in run.cars:
