@@ -66,6 +66,8 @@ class ProcessState(Struct):
     since: float = 0.0
     heard_at: float = -inf
     restarts: int = 0
+    """How often the process was started again after it had failed. A restart on request, as by a reload, is no
+    failure."""
     words: str = ""
     """Reason of the last failure."""
     _failures: int = 0
@@ -108,12 +110,13 @@ class ProcessState(Struct):
             return self._kill(f"{HUNG}: no heartbeat for {silent:.1f} s")
         return RestartAction.NOTHING
 
-    def on_started(self, now: float) -> None:
-        """Note that the process was started."""
-        if self.since or self.restarts:
-            self.restarts += 1
+    def on_started(self, now: float) -> bool:
+        """Note that the process was started. Return True if that follows a failure."""
+        failed = bool(self.since or self.restarts) and (self._killed or not self._again)
+        self.restarts += failed
         self._set(RunState.STARTING, now)
-        self._killed = False
+        self._killed = self._again = False
+        return failed
 
     def on_heartbeat(self, now: float) -> bool:
         """Note a heartbeat. Return True if it is the first one."""
@@ -149,7 +152,7 @@ class ProcessState(Struct):
 
     def end(self, now: float, grace_s: float, *, again: bool = False) -> bool:
         """Note that the process must exit, and restart if `again`. Return True if there is a process to signal."""
-        self._again = again
+        self._again = again and self.alive
         if self.state is RunState.ENDING:
             return False
         if not self.alive:

@@ -202,9 +202,9 @@ class ProcessSet:
             process.status.on_start_failed(f"cannot be started: {error.strerror}", now, random.random())  # noqa: S311 - jitter
             self._on_event(process.name, process.status.words)
             return
-        process.status.on_started(now)
-        why = f" ({process.status.words})" if process.status.words else ""
-        again = f" again{why}" if process.status.restarts else ""
+        failed = process.status.on_started(now)
+        why = f" ({process.status.words})" if failed and process.status.words else ""
+        again = f" again{why}" if process.code is not None else ""
         self._on_event(process.name, f"started{again}, process {process.child.pid}")
 
     def _ended(self, process: ManagedProcess, code: int) -> None:

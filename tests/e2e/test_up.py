@@ -460,6 +460,8 @@ def test_reload_applies_what_it_can_and_bad_file_changes_nothing(fleet: FleetPro
         assert "blue is restarted" in started.fleet("reload").stdout
         started.running("blue", but=pid)
         started.ready("blue")
+        assert started.state("blue").restarts == 0, "somebody wanted it"
+        assert "started again" not in started.fleet("doctor").stdout
         answer = started.ask("drive", "blue", motion="forward", duration_s=4)
         assert answer["reason"] == "bad_value"
         assert started.running("red") == before["red"]

@@ -149,6 +149,16 @@ def test_begun_anew_is_no_fall() -> None:
     state.end(110.0, 7.0, again=True)
     state.on_exit(0, "", 111.0, 0.5)
     assert state.turn(111.0, 0.0) is RestartAction.START
+    assert not state.on_started(111.0)
+    assert (state.restarts, state.words) == (0, ""), "`fleet doctor` would call it odd"
+    state.on_exit(1, "no room", 112.0, 0.5)
+    assert state.on_started(113.0)
+    assert state.restarts == 1
+    state.end(114.0, 7.0, again=True)
+    assert state.turn(121.0, 0.0) is RestartAction.KILL
+    state.on_exit(-9, "", 121.1, 0.5)
+    assert state.on_started(122.0), "it was killed before it was started again"
+    assert (state.restarts, state.words) == (2, "did not end in time and was killed")
 
 
 def test_process_served_elsewhere_is_not_started() -> None:
