@@ -443,6 +443,7 @@ class Supervisor:
                 self._gateways_from = self.processes.now
             self._recorder_heard_at = self.processes.now
             self._drops[value.session] = sum(value.drops.values())
+            self._session = "" if value.state == RecorderState.STOPPED else value.session
             over = ""
             if value.state == RecorderState.CLOSED:
                 over = "closed, and some of what waited is lost" if value.drops else "what waited is written"

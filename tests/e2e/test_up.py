@@ -177,6 +177,20 @@ def test_status_and_logs_say_what_runs(up: Up) -> None:
     assert " mean green?" in wrong.stderr
 
 
+def test_status_names_the_session_that_is_recorded_now(up: Up) -> None:
+    """It named the first one, also while nothing was recorded, and while the next one was."""
+    first = up.fleet("record", "stop")
+    assert first.returncode == 0, first.stderr
+    wait_for(lambda: up.status().session == "", "nothing is recorded")
+    assert up.fleet("status").stdout.splitlines()[0].endswith(", not recording")
+    started = up.fleet("record", "start")
+    assert started.returncode == 0, started.stderr
+    session = wait_for(lambda: up.status().session, "it is recorded again")
+    assert f" {session}, " in started.stdout
+    assert f" {session}, " not in first.stdout
+    assert up.fleet("status").stdout.splitlines()[0].endswith(f", recording to {session}")
+
+
 def test_command_that_is_none_is_refused(up: Up) -> None:
     for verb, payload, words in (("up", "{}", "allowed are down, reload"), ("down", "{", "is not the JSON")):
         selector = f"fleet/@supervisor/@cmd/{verb}?format=json"
