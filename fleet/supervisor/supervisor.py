@@ -56,6 +56,8 @@ one after 0.5 s."""
 RECORDER_START_TIMEOUT_S: Final = 5.0
 """Timeout for the recorder's first heartbeat. Gateways start only after this heartbeat or timeout, so that the recorder
 misses nothing."""
+SILENT_PROCESS_S: Final = 3.0
+"""Silence after which a process is named as not ready. It has then missed at least two heartbeats, and may hang."""
 RECORDER_LOST_S: Final = 2.0
 """Time without a status of a recorder after which the fleet counts as not recorded. A recorder sends one each
 second."""
@@ -208,12 +210,19 @@ class Supervisor:
             elif why := row.state.why_missing(now):
                 result[name] = why
         for process in self.processes:
-            up = process.status.state in (RunState.RUNNING, RunState.ELSEWHERE)
-            if process.kind is not ProcessKind.GATEWAY and not up:
-                result[process.name] = process.status.words or str(process.status.state)
+            if process.kind is not ProcessKind.GATEWAY and (why := self._why_not_up(process)):
+                result[process.name] = why
         if self._unrecorded:
             result.setdefault(RECORDER, self._unrecorded)
         return result
+
+    def _why_not_up(self, process: ManagedProcess) -> str:
+        """Return why a service does not work now. Empty if it does."""
+        if process.status.state not in (RunState.RUNNING, RunState.ELSEWHERE):
+            return process.status.words or str(process.status.state)
+        silent_s = process.status.silent_s(self.processes.now, self._listening_since(process))
+        is_silent = process.status.state is RunState.RUNNING and silent_s > SILENT_PROCESS_S
+        return f"it has not answered for {silent_s:.0f} s" if is_silent else ""
 
     def _follow_start(self, now: float) -> None:
         """Report the end of the start once: all cars and services are ready, or none has become ready for a while."""

@@ -191,6 +191,20 @@ def test_status_names_the_session_that_is_recorded_now(up: Up) -> None:
     assert up.fleet("status").stdout.splitlines()[0].endswith(f", recording to {session}")
 
 
+@pytest.mark.parametrize("name", ["@recorder", "@console"])
+def test_service_that_hangs_is_named_before_it_is_killed(up: Up, name: str) -> None:
+    wait_for(lambda: name not in up.status().missing, f"{name} is ready")
+    pid = up.running(name)
+    freeze(pid)
+    try:
+        why = wait_for(lambda: up.status().missing.get(name), f"{name} is named")
+        assert re.fullmatch(r"it has not answered for \d+ s", why)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    wait_for(lambda: name not in up.status().missing, f"{name} answers again")
+    assert up.running(name) == pid
+
+
 def test_command_that_is_none_is_refused(up: Up) -> None:
     for verb, payload, words in (("up", "{}", "allowed are down, reload"), ("down", "{", "is not the JSON")):
         selector = f"fleet/@supervisor/@cmd/{verb}?format=json"
