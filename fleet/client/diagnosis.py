@@ -163,7 +163,8 @@ def _lost(e: CarEvidence) -> str:
     link = e.state.link
     if link.state != LinkState.LOST or _adapter_full(e):
         return ""
-    return f"The link has been lost for {link.since_s:.0f} s: {link.reason or 'no reason is known'}."
+    reason = link.reason.rstrip(".") or "no reason is known"  # some reasons are sentences
+    return f"The link has been lost for {link.since_s:.0f} s: {reason}."
 
 
 def _contradicted(e: CarEvidence) -> str:
