@@ -12,7 +12,7 @@ from fleet.client.client import Fleet
 from fleet.client.diagnosis import RECENT_COMMAND_S, CarEvidence
 from fleet.client.gateway_clock import MAX_CLOCK_OFF_S, GatewayClock
 from fleet.client.reading import Reading, age_of_answer_s
-from fleet.client.supervision import ask_status, gateways_of
+from fleet.client.supervision import ask_status, gateways_of, services_of
 from schemas import keys, messages, topics
 from schemas.bus import Sample
 from schemas.gen import fleet_v1_pb2 as pb
@@ -44,6 +44,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
     clocks = clocks_off(client, {car: at_s for car, at_s in newest_s.items() if car in present})
     now = time.time()
     commands = _commands(client)
+    services = {name: why for status in supervisions for name, why in services_of(status).items()}
     recording = next((each.value for each in client.get(f"{client.name}/{keys.RECORDER}/status")), None)
     if recording is None and (lost := [each.unrecorded for each in supervisions if each.unrecorded]):
         recording = pb.Recording(state=RecorderState.FAILED, error=lost[0])
@@ -60,6 +61,7 @@ def collect(client: Fleet) -> dict[str, CarEvidence]:
             recording=recording,
             assignment=assignment,
             coordinated=coordinated,
+            services=services,
             runs_here=car in here,
             asked=True,
         )

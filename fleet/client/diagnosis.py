@@ -4,7 +4,7 @@
 likeliest cause comes first.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from msgspec import Struct, to_builtins
@@ -16,7 +16,7 @@ from fleet.client.hints import complete_command, complete_hints
 from fleet.client.services import why_unrecorded
 from gateway import drivers
 from schemas.bluetooth import ADAPTER_FULL
-from schemas.keys import name_of
+from schemas.keys import COORDINATOR, RECORDER, name_of
 from schemas.local_time import clock
 from schemas.rights import binding_pause
 from schemas.words import (
@@ -71,6 +71,8 @@ class CarEvidence(Struct, frozen=True):
     """The roles of the plan (fleet.v1.Assignment)."""
     coordinated: bool = False
     """True if a coordinator is on the bus."""
+    services: Mapping[str, str] = {}
+    """The services that `fleet up` runs, such as `@recorder`, each with why it is not ready, or an empty text."""
     clock_off_s: float | None = None
     """How far the clock of the gateway's computer is ahead of ours. Negative if it is behind. None if it is about
     right, or not known."""
@@ -321,6 +323,11 @@ def _drops(e: CarEvidence) -> str:
     return f"The recorder dropped {count} messages: its disk is full or too slow." if count else ""
 
 
+def _service_missing(e: CarEvidence) -> str:
+    missing = {name: why for name, why in e.services.items() if why and not (name == RECORDER and _unrecorded(e))}
+    return " ".join(f"The {name.lstrip('@')} is not ready: {why.rstrip('.')}." for name, why in missing.items())
+
+
 def _stopped_plan(e: CarEvidence) -> str:
     if not e.coordinated or e.assignment is None or not e.assignment.stopped_by:
         return ""
@@ -357,6 +364,7 @@ CHECKS: Final = (
     DoctorCheck("plan_stopped", _stopped_plan, "fleet plan restart"),
     DoctorCheck("refused", _refused, "fleet why {car}"),
     DoctorCheck("not_recorded", _unrecorded, "fleet record status", of_fleet=True),
+    DoctorCheck("service_missing", _service_missing, "fleet status --processes", of_fleet=True),
     DoctorCheck("recorder_drops", _drops, "fleet record status", of_fleet=True),
 )
 """The table of findings, the likeliest cause first."""
@@ -496,9 +504,10 @@ def _services(evidence: CarEvidence, health: Any) -> Iterator[str]:
     if restarts:
         yield f"started again {_times(restarts)}"
     recording = evidence.recording
-    yield "no recorder" if recording is None else f"recorder {recording.state}"
+    absent = "recorder does not answer" if RECORDER in evidence.services else "no recorder"
+    yield absent if recording is None else f"recorder {recording.state}"
     if not evidence.coordinated:
-        yield "no plan"
+        yield "coordinator does not answer" if COORDINATOR in evidence.services else "no plan"
     elif evidence.assignment is None or not evidence.assignment.stopped_by:
         roles = () if evidence.assignment is None else evidence.assignment.roles
         role = next((role.name for role in roles if evidence.state.car in role.cars), "none")

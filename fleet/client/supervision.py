@@ -9,7 +9,7 @@ from schemas import keys, topics
 from schemas.bus import Bus, messages_of
 from schemas.colors import Rgb, parse_color
 from schemas.topics import Qos
-from schemas.words import ProcessKind
+from schemas.words import ProcessKind, RunState
 
 SUPERVISOR_STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
 MAX_GROUPS: Final = 64
@@ -48,6 +48,31 @@ def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
 def gateways_of(status: Any) -> dict[str, Any]:
     """Return the fleet.v1.Supervised of each gateway in a fleet.v1.Supervision, by car. Some may have ended."""
     return {each.name: each for each in status.processes if each.kind == ProcessKind.GATEWAY}
+
+
+def services_of(status: Any) -> dict[str, str]:
+    """Return the services in a fleet.v1.Supervision that have not ended, each with why it is not ready, or ""."""
+    return {
+        each.name: status.missing.get(each.name, "")
+        for each in status.processes
+        if each.kind != ProcessKind.GATEWAY and each.state != RunState.ENDED
+    }
+
+
+def describe_silent_coordinator(bus: Bus, fleet: str) -> str:
+    """Return a text about a coordinator that exists and does not answer, as one that hangs. Empty if there is none.
+
+    Its token on the bus ends after some 2 s of silence. But its process may go on commanding cars at any moment.
+    """
+    for status in ask_status(bus, fleet):
+        for each in status.processes:
+            if each.kind == ProcessKind.COORDINATOR and each.state != RunState.ENDED:
+                why = f" ({each.words})" if each.words and each.state != RunState.RUNNING else ""
+                words = f"The coordinator does not answer: its process is {each.state}{why}"
+                return f"{words}. See `fleet logs coordinator`"
+    if bus.tokens(keys.car_token(fleet, keys.COORDINATOR)):
+        return "The coordinator is on the bus and does not answer"
+    return ""
 
 
 def colors_of(status: Any) -> dict[str, Rgb]:

@@ -17,6 +17,7 @@ from fleet.client.client import Fleet
 from fleet.client.diagnosis import describe_people
 from fleet.client.reading import Reading
 from fleet.client.services import NO_PLAN, ask_coordinator
+from fleet.client.supervision import describe_silent_coordinator
 from fleet.commands.car_names import complete_car
 from fleet.commands.command_group import CommandGroup, say
 from fleet.commands.exit_code import WrongFile
@@ -79,12 +80,16 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
     key = f"{client.name}/{keys.COORDINATOR}/decision"
     found = {reading.value.subject: reading for reading in client.get(key)}
     people, motors = _people(client, subjects)
-    if not found and not client.bus.tokens(f"{client.name}/{keys.COORDINATOR}"):
+    if not found and not client.get(f"{client.name}/{keys.COORDINATOR}/plan"):
+        why = describe_silent_coordinator(client.bus, client.name)
         if not (subjects or people) or any(car not in motors for car in subjects):
             raise click.ClickException(_no_plan(client))
+        end = "" if why else " No plan is running."
         for car in subjects or people:
             words = "; ".join(people.get(car, [_NOBODY, f"motors {motors[car].words}"]))
-            say(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}. No plan is running.")
+            say(json.dumps({"car": car, "words": words}) if as_json else f"{car}: {words}.{end}")
+        if why:
+            raise click.ClickException(f"{why}.")
         return
     if not found and not subjects:
         click.echo("The coordinator has not decided anything yet: repeat this in a second.", err=True)
@@ -105,8 +110,10 @@ def _explain_now(client: Fleet, subjects: tuple[str, ...], *, as_json: bool) -> 
 def _no_plan(client: Fleet) -> str:
     """Return a text that says that no plan is running, and names the command that starts one.
 
-    It names `fleet up` only if no supervisor runs.
+    It names `fleet up` only if no supervisor runs. If there is a coordinator that does not answer, the text says that.
     """
+    if why := describe_silent_coordinator(client.bus, client.name):
+        return f"{why}."
     is_up = bool(client.bus.tokens(keys.car_token(client.name, keys.SUPERVISOR)))
     other = "" if is_up else ", or a fleet with one: `fleet up --plan FILE`"
     return f"{NO_PLAN}{other}."

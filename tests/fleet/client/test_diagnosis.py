@@ -80,12 +80,26 @@ ODD: dict[str, CarEvidence] = {
     "plan_stopped": evidence(coordinated=True, assignment=pb.Assignment(stopped_by="mia")),
     "refused": evidence(commands=[refused("queue_full", words="red ignores drive commands.")]),
     "not_recorded": evidence(recording=pb.Recording(state="full", error="50 MB are free")),
+    "service_missing": evidence(services={"@hub": "", "@coordinator": "it has not answered for 4 s"}),
     "recorder_drops": evidence(recording=pb.Recording(state="recording", drops={"fleet/red/sensor/line": 7})),
 }
 
 
 def test_healthy_car_has_no_finding() -> None:
     assert diagnose(evidence(process=process(), coordinated=True)) == []
+
+
+def test_service_that_does_not_answer_is_not_called_absent() -> None:
+    services = {"@recorder": "", "@coordinator": ""}
+    words = dict(describe(evidence(recording=None, services=services)))["services"]
+    assert words.endswith("recorder does not answer, coordinator does not answer")
+    assert dict(describe(evidence(recording=None)))["services"].endswith("no recorder, no plan")
+
+
+def test_recorder_that_cannot_write_is_one_finding() -> None:
+    full = pb.Recording(state="failed", error="50 MB are free")
+    found = diagnose(evidence(recording=full, services={"@recorder": "50 MB are free"}))
+    assert [each.code for each in found] == ["not_recorded"]
 
 
 def test_checks_are_all_tested() -> None:
@@ -96,7 +110,7 @@ def test_checks_are_all_tested() -> None:
 def test_finding_has_code_cause_and_todo(code: str) -> None:
     found = diagnose(ODD[code])
     assert [each.code for each in found] == [code]
-    assert found[0].of_fleet is (code in ("not_recorded", "recorder_drops"))
+    assert found[0].of_fleet is (code in ("not_recorded", "service_missing", "recorder_drops"))
     assert found[0].cause.endswith((".", "?"))
     assert found[0].todo.startswith("fleet ")
     assert "{" not in found[0].todo

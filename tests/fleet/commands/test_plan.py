@@ -76,6 +76,47 @@ def test_why_tells_that_a_new_coordinator_has_not_decided_yet() -> None:
     endpoint = free_endpoint()
     with zenoh.open(router_config(endpoint)), Fleet(endpoint, kind="person") as client:
         token = client.bus.token(keys.car_token("fleet", keys.COORDINATOR))
+
+        def answer(query: zenoh.Query) -> bool:
+            reply_message(query, "fleet/@coordinator/plan", pb.Plan(text="roles: {}"), as_json=False)
+            return True
+
+        client.bus.queryable("fleet/@coordinator/plan", answer)
         done = CliRunner().invoke(cli, ["why", "--connect", endpoint])
         assert (done.exit_code, done.stdout) == (0, ""), token
         assert done.stderr
+
+
+def test_coordinator_that_does_not_answer_is_not_called_absent(tmp_path: Path) -> None:
+    """Such as one that hangs: its token ends after 2 s. "No plan is running" was said, and "Start one"."""
+    plan, endpoint = tmp_path / "plan.yaml", free_endpoint()
+    plan.write_text("roles: {line: {mode: tracking}}\n", encoding="utf-8")
+    status = pb.Supervision(state="running", processes=[pb.Supervised(name="@coordinator", kind="coordinator")])
+    status.processes[0].state = "running"
+    safety = pb.Safety(car="red", motors="off", motors_basis="shown")
+
+    def run(*words: str) -> Result:
+        return CliRunner().invoke(cli, [*words, "--connect", endpoint])
+
+    with zenoh.open(router_config(endpoint)), Fleet(endpoint, kind="person") as client:
+
+        def answer(query: zenoh.Query) -> bool:
+            key = str(query.key_expr)
+            reply_message(query, key, status if key.endswith("/status") else safety, as_json=False)
+            return True
+
+        token = client.bus.token(keys.car_token("fleet", keys.COORDINATOR))
+        for words in (["why", "red"], ["plan", "show"]):
+            assert "is on the bus and does not answer" in run(*words).stderr, words
+        token.undeclare()
+        client.bus.queryable("fleet/@supervisor/status", answer)
+        client.bus.queryable("fleet/red/state/safety", answer)
+        for words in (["plan", "set", str(plan)], ["plan", "show"], ["plan", "stop"], ["why"], ["why", "red"]):
+            done = run(*words)
+            assert (done.exit_code, "does not answer: its process is running. " in done.stderr) == (1, True), words
+            assert "No plan" not in done.output
+        assert run("why", "red").stdout == "red: nobody has stopped, borrowed or drives it; motors off (shown).\n"
+        status.processes[0].state, status.processes[0].words = "waiting", "was ended by signal 9"
+        assert "its process is waiting (was ended by signal 9). " in run("why", "red").stderr
+        status.processes[0].state = "ended"
+        assert run("why", "red").stdout.endswith(" No plan is running.\n")
