@@ -18,6 +18,9 @@ from schemas.printable import printable
 
 MAX_CLOCK_OFFSET_S: Final = 0.5
 """A larger offset of a publisher's clock from the recorder's clock is reported."""
+MAX_DISORDER_NS: Final = 1_000_000_000
+"""Maximum time by which a message may have been received before the message that stands before it in the file. While
+backfilled messages are written, others arrive and wait. A larger step is one of the recorder's clock."""
 MAX_LISTED_LINES: Final = 20
 """Maximum number of gaps to print, and of duplicates and of clock steps. --json lists all."""
 
@@ -195,7 +198,7 @@ class _Verifier:
         verdict = self._verdict
         if self._last_ns is None:
             verdict.first_ns = verdict.last_ns = log_ns
-        elif log_ns < self._last_ns:
+        elif log_ns < self._last_ns - MAX_DISORDER_NS:
             verdict.backwards.append({"at_ns": log_ns, "step_s": (self._last_ns - log_ns) / 1e9})
         verdict.first_ns, verdict.last_ns = min(verdict.first_ns, log_ns), max(verdict.last_ns, log_ns)
         self._last_ns = log_ns

@@ -297,7 +297,7 @@ class Recorder:
             batch, self._queue = self._queue, []
             overflow, self._overflow = self._overflow, {}
             has_room = self._queued_messages <= self._max_messages / 2 and self._queued_bytes <= self._max_bytes / 2
-        backfilled = self._backfill.take_answers()
+        backfilled, answered_ns = self._backfill.take_answers(), self._now()
         if self._recording:
             add = self._session.add
             self._writing = iter(batch)
@@ -305,7 +305,7 @@ class Recorder:
                 add(*item)
             self._pin(batch)
             self._take_marks(batch)
-            self._add_backfilled(backfilled)
+            self._add_backfilled(backfilled, answered_ns)
             for (key, sender), (count, number) in overflow.items():
                 self._session.drop_received(key, sender, number, count)
             if self._session.gaps and has_room:  # without room, the answers would delay the writer even more
@@ -336,10 +336,11 @@ class Recorder:
                     mark: Any = messages.parse(MARK_TOPIC.message, payload, str(encoding))
                     self._session.mark(mark.message[:MAX_MARK_CHARACTERS], mark.name[:MAX_MARK_CHARACTERS], received_ns)
 
-    def _add_backfilled(self, samples: Sequence[zenoh.Sample]) -> None:
+    def _add_backfilled(self, samples: Sequence[zenoh.Sample], answered_ns: int) -> None:
+        """Write answers of publishers. `answered_ns` is when they were taken: later messages wait in the queue."""
         late: list[tuple[int, str, str, bytes]] = []
         for sample in samples:
-            new, key = self._session.add_backfilled(sample, self._now()), str(sample.key_expr)
+            new, key = self._session.add_backfilled(sample, answered_ns), str(sample.key_expr)
             if new and sample.timestamp is not None and self._pin_watch.is_watched(key):
                 published_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
                 late.append((published_ns, key, str(sample.encoding), sample.payload.to_bytes()))

@@ -91,6 +91,15 @@ def test_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> None:
     assert (one["first_ns"], one["last_ns"]) == (BEGUN_NS - 3600 * SECOND_NS, BEGUN_NS + 2 * SECOND_NS + 9)
 
 
+def test_messages_that_waited_for_backfilled_ones_are_no_step_of_the_clock(tmp_path: Path) -> None:
+    """`fleet sessions verify` and `doctor` said after each restart of a recorder that its clock had gone back."""
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    for at_ns in (0, SECOND_NS, SECOND_NS - 40_000_000):
+        feed(tape, BEGUN_NS + at_ns)
+    tape.close(BEGUN_NS + 2 * SECOND_NS)
+    assert verify(Session(tape.path)).backwards == []
+
+
 def test_session_that_has_enough_says_so(tmp_path: Path) -> None:
     tape = SessionWriter(tmp_path, "fleet", Options(quota=Quota(session=100_000)), BEGUN_NS)
     feed(tape, BEGUN_NS)
