@@ -128,7 +128,8 @@ ENTITIES: Final = (
     Entity(
         "connected",
         "Connection",
-        lambda state, now: is_available(state, now) and state.link.state == LinkState.ONLINE,
+        # In some modes, some cars send nothing: their links are quiet, and open.
+        lambda state, now: is_available(state, now) and state.link.state in (LinkState.ONLINE, LinkState.QUIET),
         {**_flag("connectivity"), "entity_category": "diagnostic"},
         of_absent=True,
     ),

@@ -52,6 +52,12 @@ def test_car_is_announced_once_with_entity_for_each_value() -> None:
     assert list(plan.news({"red": car()}, 0.5)) == []
 
 
+def test_car_is_connected_while_its_silence_is_expected() -> None:
+    """A car that sends nothing in its mode was shown as disconnected, and as moving."""
+    found = {link: values(HomeAssistant("fleet").news({"red": car(link=link)}, 0.0)) for link in ("quiet", "stale")}
+    assert {link: each["connected"] for link, each in found.items()} == {"quiet": True, "stale": False}
+
+
 def test_only_what_was_measured_has_a_value() -> None:
     plan = HomeAssistant("fleet")
     assert values(plan.news({"red": car()}, 0.0)) == {each.name: None for each in ENTITIES} | {"connected": True}
