@@ -2,18 +2,20 @@
 
 import asyncio
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, Self
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table as Grid
 from rich.text import Text
 
+from fleet.client.claims import describe_age
 from fleet.column_widths import fit_columns
 from fleet.supervisor.car_status import CarStatus
 from schemas.keys import name_of
 from schemas.local_time import clock
+from schemas.rights import binding_pause
 from schemas.words import BatteryLevel, LinkState, RunState, Verdict
 
 if TYPE_CHECKING:
@@ -71,13 +73,13 @@ class Table:
     def rendered(self) -> Group:
         """Return the table, with the states of the services below it."""
         grid = Grid(box=None, pad_edge=False, header_style="bold", expand=True)
-        rows = []
+        rows, now = [], time.monotonic()
         colors = self._supervisor.colors
         for name, status in self._supervisor.rows.items():
             process = self._supervisor.processes.get(name)
             running = process is not None and process.status.state is RunState.RUNNING
             state = "" if running else RunState.STARTING if process is None else str(process.status.state)
-            rows.append(dict(zip(_TABLE_COLUMNS, _cells(status, state, colors.get(name, "")), strict=True)))
+            rows.append(dict(zip(_TABLE_COLUMNS, _cells(status, state, colors.get(name, ""), now), strict=True)))
         widths = {each: max([len(each), *(row[each].cell_len for row in rows)]) for each in _TABLE_COLUMNS}
         widths[_EVENT] = _MIN_EVENT_WIDTH
         widths = fit_columns(widths, self._console.width, _OPTIONAL_COLUMNS)
@@ -106,23 +108,36 @@ class Table:
             self._broken = True
 
 
-def _cells(row: CarStatus, process: str, color: str) -> list[Text]:
+def _holders(safety: Any) -> Iterator[str]:
+    """Yield who keeps the car from driving, as `fleet list` does."""
+    if safety.estops:
+        yield f"e-stop {' '.join(each.id for each in safety.estops)}"
+    elif safety.HasField("hold"):
+        yield f"hold {name_of(safety.hold.by)}"
+    if safety.pauses:
+        yield f"paused by {name_of(binding_pause(safety.pauses).by)}"
+    if safety.HasField("loan"):
+        yield f"lent to {safety.loan.to}"
+
+
+def _cells(row: CarStatus, process: str, color: str, now: float) -> list[Text]:
+    """Return the cells of a row. `now` is the time by the clock of the row's messages."""
     state, safety, battery = row.state, row.state.newest("state/safety"), row.state.newest("sensor/battery")
+    claims = state.claims(now)
     link = process if process or not state.link.state else state.link.state
-    held = ""
-    if safety is not None and safety.estops:
-        held = f"e-stop {' '.join(each.id for each in safety.estops)}"
-    elif safety is not None and safety.HasField("hold"):
-        held = f"hold {name_of(safety.hold.by)}"
+    old = f" ({describe_age(state.age_s('state/link', now))} old)" if not process and claims.link.is_stale else ""
+    held = "" if safety is None else ", ".join(_holders(safety))
     volts = "" if battery is None else f"{battery.voltage_v:.2f} V"
+    if state.is_stale("sensor/battery", now) and battery is not None:
+        volts += f", {describe_age(state.age_s('sensor/battery', now))} old"
     is_low = battery is not None and battery.level != BatteryLevel.OK
     rate = "" if row.rate_hz is None else f"{row.rate_hz:.1f}"
     return [
         Text.assemble(("● " if color else "", color), (row.car, "bold")),
-        Text(link, _LINK.get(link, "yellow")),
+        Text(f"{link}{old}", "yellow" if old else _LINK.get(link, "yellow")),
         Text.assemble(state.mode.asked, " ", (state.mode.verdict, _VERDICT.get(state.mode.verdict, ""))),
         Text(state.motion.motion),
-        Text(row.motors.with_basis if state.safety.motors else ""),
+        Text(claims.motors.short if state.safety.motors else ""),
         Text(held or name_of(state.safety.lease.holder), "red" if held else ""),
         Text(f"{volts} {battery.level}" if is_low else volts, "red" if is_low else ""),
         Text(rate, justify="right"),

@@ -2,6 +2,7 @@
 
 import io
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -181,13 +182,14 @@ def test_status_table_fits_width_and_names_every_car(width: int) -> None:
         supervisor.processes.add(name, kind, ())
     for process in supervisor.processes:
         process.status.state = RunState.RUNNING
+    now = time.monotonic()
     for name in ("red", "green"):
         row = supervisor.rows[name] = CarStatus(name, event="x" * 300)
-        row.take("state/link", pb.Link(state="online"), 0.0)
-        row.take("state/mode", pb.Mode(asked="obstacle_avoidance"), 0.0)
+        row.take("state/link", pb.Link(state="online"), now)
+        row.take("state/mode", pb.Mode(asked="obstacle_avoidance"), now)
     leased = pb.Safety(lease=pb.Lease(holder="ann_of_the_laboratory_desk@laptop-4711"))
-    supervisor.rows["red"].take("state/safety", leased, 0.0)
-    supervisor.rows["red"].take("sensor/battery", pb.Battery(voltage_v=7.42, level="critical"), 0.0)
+    supervisor.rows["red"].take("state/safety", leased, now)
+    supervisor.rows["red"].take("sensor/battery", pb.Battery(voltage_v=7.42, level="critical"), now)
     console = Console(file=io.StringIO(), width=width)
     console.print(Table(supervisor, console).rendered())
     assert isinstance(console.file, io.StringIO)
@@ -205,27 +207,56 @@ def test_status_table_names_holder_driver_and_last_word() -> None:
     spec = FleetSpec(endpoint="tcp/127.0.0.1:7999")
     supervisor = Supervisor(spec, "", lambda: spec, lambda event: None)
     row = supervisor.rows["red"] = CarStatus("red")
-    console = Console(file=io.StringIO(), width=200)
+    console, now = Console(file=io.StringIO(), width=200), time.monotonic()
 
     def line() -> str:
         with console.capture() as shown:
             console.print(Table(supervisor, console).rendered())
         return next(each for each in shown.get().splitlines() if each.startswith("red"))
 
-    row.take("sensor/battery", pb.Battery(voltage_v=7.94, level="ok"), 0.0)
+    row.take("sensor/battery", pb.Battery(voltage_v=7.94, level="ok"), now)
     leased = pb.Safety(motors="off", motors_basis="sent", lease=pb.Lease(holder="mia@laptop-1"))
-    row.take("state/safety", leased, 0.0)
+    row.take("state/safety", leased, now)
     assert {"mia", "(sent)", "7.94"} <= set(line().split())
-    row.take("sensor/battery", pb.Battery(voltage_v=7.42, level="critical"), 1.0)
+    row.take("sensor/battery", pb.Battery(voltage_v=7.42, level="critical"), now)
     assert "7.42 V critical" in line()
     leased.hold.by = "ann@laptop-1"
-    row.take("state/safety", leased, 1.0)
+    row.take("state/safety", leased, now)
     assert "hold ann" in line()
+    leased.pauses.add(by="eve@laptop-1")
+    leased.loan.to = "tom"
+    row.take("state/safety", leased, now)
+    assert "hold ann, paused by eve, lent to tom" in line()
     leased.estops.add(id="e1", by="bob")
-    row.take("state/safety", leased, 2.0)
+    row.take("state/safety", leased, now)
     row.reset()
     assert "e-stop e1" in line()
     assert "(sent)" not in line(), "nobody claims it now"
+
+
+def test_status_table_says_how_old_a_value_is() -> None:
+    """A battery that was measured an hour ago looked new, and so did the link of a gateway that hangs."""
+    spec = FleetSpec(endpoint="tcp/127.0.0.1:7999")
+    supervisor = Supervisor(spec, "", lambda: spec, lambda event: None)
+    supervisor.processes.add("red", ProcessKind.GATEWAY, ())
+    for process in supervisor.processes:
+        process.status.state = RunState.RUNNING
+    row = supervisor.rows["red"] = CarStatus("red")
+    row.take("sensor/battery", pb.Battery(voltage_v=7.94, level="ok"), time.monotonic() - 3600.0)
+    row.take("state/link", pb.Link(state="online"), time.monotonic() - 5.0)
+    row.take("state/safety", pb.Safety(motors="off", motors_basis="sent"), time.monotonic() - 5.0)
+    console = Console(file=io.StringIO(), width=200)
+    with console.capture() as shown:
+        console.print(Table(supervisor, console).rendered())
+    line = next(each for each in shown.get().splitlines() if each.startswith("red"))
+    for words in ("online (5 s old)", "off (sent, 5 s old)", "7.94 V, 60 min old"):
+        assert words in line
+    for topic, message in (("state/link", pb.Link(state="online")), ("sensor/battery", pb.Battery(voltage_v=7.9))):
+        row.take(topic, message, time.monotonic())
+    row.take("state/safety", pb.Safety(motors="off", motors_basis="sent"), time.monotonic())
+    with console.capture() as shown:
+        console.print(Table(supervisor, console).rendered())
+    assert " old" not in shown.get()
 
 
 def test_log_file_is_bounded_and_keeps_newest_lines(tmp_path: Path) -> None:
