@@ -88,7 +88,9 @@ def _warning_of_recorder(bus: Bus, fleet: str) -> str:
 
 def _describe_process(process: Any) -> str:
     pid = f"process {process.pid}" if process.HasField("pid") else "no process"
-    if process.restarts:
+    if process.state == RunState.ELSEWHERE:  # the words say which program does its work
+        why = f": {process.words}"
+    elif process.restarts:
         times = "once" if process.restarts == 1 else f"{process.restarts} times"
         why = f", started again {times}: {process.words}"
     else:

@@ -1,4 +1,4 @@
-"""Time for which `fleet down` waits for a supervisor."""
+"""Time for which `fleet down` waits for a supervisor, and the line of a process in `fleet status`."""
 
 import threading
 from typing import Any
@@ -52,3 +52,11 @@ def test_supervisor_without_a_token_and_a_status_is_gone(monkeypatch: pytest.Mon
         down = Down(ours)
         down.thread.join(10.0)
         assert down.found == [(None, True)]
+
+
+def test_hub_of_another_program_is_no_reason_for_a_restart() -> None:
+    """It said "started again once: another program's hub listens", of a hub that had been killed."""
+    hub = pb.Supervised(name="@hub", kind="hub", state="elsewhere", restarts=1, words="another program's hub listens")
+    assert lifecycle._describe_process(hub).endswith(" no process: another program's hub listens")
+    hub.state, hub.pid, hub.words = "running", 7, "was ended by signal 9"
+    assert lifecycle._describe_process(hub).endswith(" process 7, started again once: was ended by signal 9")
