@@ -3,7 +3,7 @@
 import json
 import time
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 
@@ -54,12 +54,15 @@ def explain_session(car: str, path: Path, at: str, *, as_json: bool) -> None:
         timeline.begin_ns - STATE_BEFORE_NS,
         timeline.end_ns,
     )
-    recorder_clock = RecorderClock()
+    recorder_clock, found = RecorderClock(), list[tuple[int, str, Any]]()
     for each in map(known_message, session.rows(selection)):
         if each is not None:
             key = each.key
             topic = f"{key.car}/{key.topic}" if key.car.startswith("@") else key.topic
-            timeline.add(topic, each.message, recorder_clock.time_ns(each))
+            found.append((recorder_clock.time_ns(each), topic, each.message))
+    # A backfilled message stands behind later ones. It would seem to follow them, and to end the states that they show.
+    for at_ns, topic, message in sorted(found, key=lambda each: each[0]):
+        timeline.add(topic, message, at_ns)
     if as_json:
         click.echo(json.dumps(timeline.as_dict()))
         return

@@ -77,14 +77,14 @@ class _Recording:
         self.segment = Segment(path, {"fleet": "fleet"})
         self._channels: dict[str, int] = {}
 
-    def say(self, key: str, message: Any, at_s: float) -> None:
+    def say(self, key: str, message: Any, at_s: float, received_s: float | None = None) -> None:
         name = message.DESCRIPTOR.full_name
         stamp = Timestamp(seconds=int(at_s), nanos=round(at_s % 1 * 1e9))
         (message.timestamp if name == "foxglove.Log" else message.stamp).CopyFrom(stamp)
         if key not in self._channels:
             self._channels[key] = self.segment.channel(key, messages.encoding_of(name))
-        at_ns = round(at_s * 1e9)
-        self.segment.add(self._channels[key], at_ns, message.SerializeToString(), at_ns, 0)
+        at_ns, received_ns = round(at_s * 1e9), round((at_s if received_s is None else received_s) * 1e9)
+        self.segment.add(self._channels[key], received_ns, message.SerializeToString(), at_ns, 0)
 
 
 @pytest.fixture
@@ -164,6 +164,30 @@ def test_why_did_red_not_stop_at_that_time(session: Path, tmp_path: Path) -> Non
     early = berlin(tmp_path, "why", "red", "--session", "latest", "--at", "13:00:05")
     assert early.stdout.splitlines()[0].startswith("red: no stop ")
     assert "2026-11-25 13:00:05 CET" in early.stdout.splitlines()[0]
+
+
+def test_why_tells_backfilled_messages_in_their_order(tmp_path: Path) -> None:
+    """What a recorder has missed, as during a restart of the hub, stands in the file where it was received."""
+    path = tmp_path / "sessions" / "20261125T120000Z-lab"
+    path.mkdir(parents=True)
+    recording = _Recording(path / "0001.mcap")
+
+    def say(motors: str, at_s: float, received_s: float | None = None) -> None:
+        recording.say("fleet/red/state/safety", pb.Safety(car="red", motors=motors), at_s, received_s)
+
+    for second in range(10):
+        say("off" if second < 8 else "on", NOON + second)
+    say("stopping", NOON + 12)
+    say("on", NOON + 10, NOON + 13)
+    say("on", NOON + 11, NOON + 13)
+    say("off", NOON + 14)
+    recording.segment.finish({})
+    describe(path, closed=True)
+    entries = json.loads(berlin(tmp_path, "why", "red", "--session", "latest", "--at", "10s", "--json").stdout)[
+        "entries"
+    ]
+    assert [each["words"] for each in entries] == ["motors off", "motors on", "motors stopping", "motors off"]
+    assert [each["at"] for each in entries] == [f"13:00:{second} CET" for second in ("00", "08", "12", "14")]
 
 
 @pytest.mark.parametrize(
