@@ -469,7 +469,7 @@ export const t = {
   lostMessages: (count) => `⚠ ${count} messages lost`,
   kept: "kept",
   otherActions: "More",
-  sessionStates: { whole: "✓ whole", recording: "● recording", cut: "✕ cut", damaged: "✕ damaged", thinned: "✓ thinned", recovered: "✓ recovered", unreadable: "✕ unreadable" },
+  sessionStates: { whole: "✓ whole", recording: "● recording", cut: "✕ cut", damaged: "✕ damaged", thinned: "✓ thinned", recovered: "✓ recovered", gaps: "✕ gaps", unreadable: "✕ unreadable" },
   verify: "Verify",
   download: "Download",
   exportAs: { csv: "Export CSV", parquet: "Export Parquet" },

@@ -41,6 +41,7 @@ class SessionState(StrEnum):
     DAMAGED = "damaged"  # files, session.json or messages are missing, or a file is not an MCAP file
     THINNED = "thinned"  # whole, except for files that the quota removed
     RECOVERED = "recovered"  # whole, but made from an incomplete session
+    GAPS = "gaps"  # all files are whole, but the recorder lost messages
     UNREADABLE = "unreadable"  # no file can be read, or the format is newer than ours
 
 
@@ -145,6 +146,9 @@ def of_session(session: Session) -> SessionSummary:
         found.state = SessionState.THINNED
     if found.state is SessionState.WHOLE and (words := lost_words(session)):
         found.state, found.words = SessionState.RECOVERED, words
+    if found.state is SessionState.WHOLE and found.lost:
+        found.state = SessionState.GAPS
+        found.words = f"{found.lost} messages were lost: `fleet sessions verify {typed_name(session)}` lists them"
     return found
 
 

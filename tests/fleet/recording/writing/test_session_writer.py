@@ -12,6 +12,7 @@ from fleet.quota import Quota
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SessionInfo
+from fleet.recording.tools.summary import SessionState, of_session
 from fleet.recording.tools.verify import verify
 from fleet.recording.writing.disk_space import MB
 from fleet.recording.writing.session_writer import Options, SessionWriter, Sync
@@ -89,6 +90,19 @@ def test_clock_that_goes_back_loses_nothing_and_is_told(tmp_path: Path) -> None:
     assert [round(one["step_s"]) for one in verdict.backwards] == [3602]
     (one,) = json.loads((tape.path / session_dir.INDEX_FILE).read_text())["segments"]
     assert (one["first_ns"], one["last_ns"]) == (BEGUN_NS - 3600 * SECOND_NS, BEGUN_NS + 2 * SECOND_NS + 9)
+
+
+def test_session_that_lacks_messages_is_whole_to_nobody(tmp_path: Path) -> None:
+    """`fleet sessions` called it whole, while `fleet sessions verify` said NOT whole, with exit code 1."""
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    feed(tape, BEGUN_NS)
+    tape.drop_received("fleet/red/note", None, 0, 3)
+    tape.close(BEGUN_NS + SECOND_NS)
+    session = Session(tape.path)
+    about = of_session(session)
+    assert (about.state, about.lost) == (SessionState.GAPS, 3)
+    assert about.words.startswith("3 messages were lost: `fleet sessions verify ")
+    assert not verify(session).whole
 
 
 def test_messages_that_waited_for_backfilled_ones_are_no_step_of_the_clock(tmp_path: Path) -> None:
