@@ -144,7 +144,8 @@ def _describe(reading: Reading, people: Sequence[str], motors: CarClaim | None) 
     if motors is not None:
         lines.append(f"  motors: {motors.words}")
     lines += [f"  person: {each}" for each in people]
-    lines += [f"  reading: {each}" for each in decision.readings]
+    # Their ages are those at the time of the decision.
+    lines += [f"  reading then: {each}" for each in decision.readings]
     lines += [f"  would change if: {each}" for each in decision.would_change.split("; or ")]
     return "\n".join(lines)
 

@@ -288,7 +288,7 @@ export const t = {
   noCar: "no car",
   why: "Why",
   because: (words) => `Because: ${words}`,
-  reading: (words) => `Reading: ${words}`,
+  reading: (words) => `Reading then: ${words}`,
   wouldChange: (words) => `Would change if: ${words}`,
   planNext: "Next phase",
   planRestart: "Restart the plan",

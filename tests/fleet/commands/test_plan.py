@@ -120,3 +120,19 @@ def test_coordinator_that_does_not_answer_is_not_called_absent(tmp_path: Path) -
         assert "its process is waiting (was ended by signal 9). " in run("why", "red").stderr
         status.processes[0].state = "ended"
         assert run("why", "red").stdout.endswith(" No plan is running.\n")
+
+
+def test_why_does_not_call_the_readings_of_a_decision_new() -> None:
+    """A reading from which a decision followed a minute ago was printed as 0.4 s old."""
+    endpoint = free_endpoint()
+    decision = pb.Decision(subject="red", decided="tracking", why="role line (1 of 1)", would_change="a stop")
+    decision.readings.append("red/sensor/battery voltage_v=7.4 (0.4 s old)")
+    with zenoh.open(router_config(endpoint)), Fleet(endpoint, kind="person") as client:
+
+        def answer(query: zenoh.Query) -> bool:
+            reply_message(query, "fleet/@coordinator/decision", decision, as_json=False)
+            return True
+
+        client.bus.queryable("fleet/@coordinator/decision", answer)
+        shown = CliRunner().invoke(cli, ["why", "red", "--connect", endpoint]).stdout.splitlines()
+    assert "  reading then: red/sensor/battery voltage_v=7.4 (0.4 s old)" in shown
