@@ -31,7 +31,7 @@ class SpecChange(Struct, frozen=True):
     restarted: tuple[str, ...]
     """Cars whose gateway is started or restarted."""
     words: tuple[str, ...]
-    """One line for each car that changes. Changes of groups and colors have none."""
+    """One line for each car that changes, for the groups, and for the colors of cars that stay."""
     needs_restart: tuple[str, ...] = ()
     """Properties and cars that cannot change while the fleet runs, in words."""
 
@@ -65,6 +65,10 @@ def compare(old: FleetSpec, new: FleetSpec) -> SpecChange:
         for name in cars
         if name not in restarted and (difference := _describe_difference(old.listed.get(name), listed.get(name)))
     ]
+    if old.groups != new.groups:
+        words.append("the groups have changed")
+    if colored := [name for name in cars if name in old.cars and old.colors.get(name) != new.colors.get(name)]:
+        words.append(f"in another color now: {', '.join(colored)}")
     spec = replace(
         old,
         cars=cars,

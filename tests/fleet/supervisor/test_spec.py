@@ -206,6 +206,16 @@ def test_cars_come_go_and_change() -> None:
     assert found.words == ("bob is restarted", "eve is added", "ann is removed")
 
 
+def test_other_groups_and_colors_are_told() -> None:
+    """They were in force, but `fleet reload` said that nothing had changed."""
+    old = replace(OLD, colors={"ann": "#010203", "bob": "#030201", "sim": "#000001"}, groups={"a": ("ann",)})
+    new = replace(old, colors={**old.colors, "bob": "#ff0000", "eve": "#00ff00"}, groups={"a": ("ann", "bob")})
+    found = compare(old, new)
+    assert found.words == ("the groups have changed", "in another color now: bob")
+    assert (found.spec.groups, found.spec.colors) == (new.groups, new.colors)
+    assert compare(new, new).words == ()
+
+
 def test_gateway_of_a_simulated_car_restarts_with_other_people() -> None:
     car = replace(OLD.cars["sim"], arguments=("--people-only", "--person", "lee"))
     found = compare(OLD, replace(OLD, cars={**OLD.cars, "sim": car}))
