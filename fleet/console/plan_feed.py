@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fleet.aio import Fleet
+from fleet.client.supervision import describe_silent_coordinator
 from fleet.console.bus_message import is_shown, message_in
 from fleet.console.hold_to_drive import TOO_LATE
 from fleet.console.operator import ConsoleOperator
@@ -96,7 +97,10 @@ class PlanFeed(PageFeed):
             page.operator.spawn(self._ask_coordinator(page, request_id, verb))
 
     async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
-        ok, words = await page.operator.ask_coordinator(verb) or (False, "No plan is running. Put one in force.")
+        if (answer := await page.operator.ask_coordinator(verb)) is None:
+            silent = await self._fleet.call(describe_silent_coordinator, self._fleet.sync.bus, self._fleet.sync.name)
+            answer = False, f"{silent}." if silent else "No plan is running. Put one in force."
+        ok, words = answer
         page.answer(t="plan_done", id=request_id, ok=ok, words=words)
 
     async def check(self, text: str, person: PagePerson | None) -> dict[str, Any]:

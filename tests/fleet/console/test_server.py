@@ -345,6 +345,19 @@ def book_file(stage: ServerStage) -> PeopleFile:
         return PeopleFile(people_path(stage.fleet.endpoint, "fleet"))
 
 
+def test_page_tells_coordinator_that_hangs_from_none(stage: ServerStage) -> None:
+    teacher = stage.device("teacher", "--rank", "lead")
+
+    def asked(page: Any) -> str:
+        page.send(json.dumps({"t": "plan", "id": 8, "verb": "stop"}))
+        return str(next_message(page, "plan_done")["words"])
+
+    with Bus.open(stage.fleet.endpoint) as bus, teacher.socket() as page:
+        assert asked(page).startswith("No plan is running")
+        token = bus.token(car_token("fleet", "@coordinator"))
+        assert asked(page) == "The coordinator is on the bus and does not answer.", token
+
+
 def test_recordings_and_plans_need_a_lead(stage: ServerStage) -> None:
     driver, teacher = stage.device("mia"), stage.device("teacher", "--rank", "lead")
     own = {"Origin": stage.console.address, "Cookie": loopback_cookie(stage)}
