@@ -98,10 +98,13 @@ class PlanFeed(PageFeed):
 
     async def _ask_coordinator(self, page: PageLink, request_id: int, verb: str) -> None:
         if (answer := await page.operator.ask_coordinator(verb)) is None:
-            silent = await self._fleet.call(describe_silent_coordinator, self._fleet.sync.bus, self._fleet.sync.name)
+            silent = await self._silent_coordinator()
             answer = False, f"{silent}." if silent else "No plan is running. Put one in force."
         ok, words = answer
         page.answer(t="plan_done", id=request_id, ok=ok, words=words)
+
+    async def _silent_coordinator(self) -> str:
+        return await self._fleet.call(describe_silent_coordinator, self._fleet.sync.bus, self._fleet.sync.name)
 
     async def check(self, text: str, person: PagePerson | None) -> dict[str, Any]:
         """Return the answer to a person about a plan (plan_answer.answer_to). Raises TooManyQuestions."""
@@ -120,7 +123,7 @@ class PlanFeed(PageFeed):
         if not found["ok"]:
             return found
         ask = partial(self._operator.ask_coordinator, "plan", text, sender)
-        ok, words = await self._process.set_plan(text, ask)
+        ok, words = await self._process.set_plan(text, ask, self._silent_coordinator)
         return {"ok": ok, "words": named(words, text)}
 
     def on_page(self, page: PageLink) -> None:

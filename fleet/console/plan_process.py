@@ -29,14 +29,20 @@ class PlanProcess:
         self._process: Process | None = None
         self._starting = asyncio.Lock()
 
-    async def set_plan(self, text: str, ask: Callable[[], Awaitable[tuple[bool, str] | None]]) -> tuple[bool, str]:
+    async def set_plan(
+        self, text: str, ask: Callable[[], Awaitable[tuple[bool, str] | None]], silent: Callable[[], Awaitable[str]]
+    ) -> tuple[bool, str]:
         """Put a plan in force, and start a coordinator if there is none. Return the answer, or what went wrong.
 
-        ask: asks the coordinator to put the plan in force. It returns None if there is no coordinator.
+        ask: asks the coordinator to put the plan in force. It returns None if none answers. silent: returns a text
+        about another program's coordinator that does not answer. It may go on at any moment, so none is started beside.
         """
         async with self._starting:
             if (answer := await ask()) is not None:
                 return answer
+            is_ours = self._process is not None and self._process.returncode is None
+            if not is_ours and (why := await silent()):
+                return False, f"{why}."
             await self.close()
             with tempfile.TemporaryDirectory(prefix="fleet-console-", ignore_cleanup_errors=True) as name:
                 plan, errors = Path(name) / "plan.yaml", Path(name) / "errors"

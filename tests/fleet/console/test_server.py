@@ -356,6 +356,9 @@ def test_page_tells_coordinator_that_hangs_from_none(stage: ServerStage) -> None
         assert asked(page).startswith("No plan is running")
         token = bus.token(car_token("fleet", "@coordinator"))
         assert asked(page) == "The coordinator is on the bus and does not answer.", token
+        status, text = teacher.ask("POST", "/plan/set", "roles:\n  guide: {mode: tracking}\n")
+        assert (status, json.loads(text)["ok"]) == (200, False)
+        assert "does not answer" in text.decode(), "no second one is started"
 
 
 def test_recordings_and_plans_need_a_lead(stage: ServerStage) -> None:
