@@ -191,11 +191,18 @@ class Executor(Driver):
     def _drive_at(self) -> float:
         """Return the earliest time for the next frame of the waiting drive.
 
-        A step of the speed, and the frame after it, wait until the car has read the frame before it. Of two frames in
-        its buffer, the car may ignore one, and a lost step would let it drive too fast.
+        A step of the speed before a drive, and the frame after it, wait until the car has read the frame before it. Of
+        two frames in its buffer, the car may ignore one, and a lost step would let it drive too fast.
         """
-        alone = self._is_too_fast or self._speeds_before_step is not None
-        return max(self.model.ready_at, self.model.pacing.buffer_until) if alone else self.model.ready_at
+        ready_at, buffer_until = self.model.ready_at, self.model.pacing.buffer_until
+        return max(ready_at, buffer_until) if self._is_too_fast or self._must_not_lose_step else ready_at
+
+    @property
+    def _must_not_lose_step(self) -> bool:
+        """Return True if the last frame was a step of the speed without which the car may be too fast."""
+        # Any other step may be lost. If a drive waited for it, a driver that has just changed the speed could not turn.
+        before = self._speeds_before_step
+        return before is not None and share_of(before, self.model.profile.kind) > self.desk.speed_max
 
     def _drive_waits(self, now: float) -> bool:
         """Return True if a drive waits until the car has read a step of its speed. No other command goes before it."""
@@ -241,9 +248,9 @@ class Executor(Driver):
 
     def drive_wait_s(self, busy_s: float, now: float) -> float:
         """Return the longest wait, in s, of a drive until its frame is written."""
-        del now
-        steps = len(self.steps_before_drive)
-        return busy_s + (steps + 1) * REPEAT_INTERVAL_S if steps else busy_s
+        if steps := len(self.steps_before_drive):
+            return busy_s + (steps + 1) * REPEAT_INTERVAL_S
+        return max(busy_s, self._drive_at - now)
 
     def mode_wait_s(self, busy_s: float, now: float) -> float:
         """Return the longest wait, in s, of a mode until its frame is written. `busy_s` is the same for a motion."""

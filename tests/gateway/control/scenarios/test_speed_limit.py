@@ -90,6 +90,33 @@ def test_stream_drives_after_steps_down() -> None:
     assert pair.car.motor_log[-1][1:] == (0, 0)
 
 
+@pytest.mark.parametrize("step", [SpeedStep.UP, SpeedStep.DOWN])
+def test_car_turns_at_once_after_a_step_that_may_be_lost(step: SpeedStep) -> None:
+    """Without an echo, it drove on ahead for up to 1.1 s, as if the step had been needed for the limit."""
+    pair = Pair("arduino", world=World.open_field()).ready()
+    pair.run(10.0)
+    pair.ask(Drive(Motion.FORWARD, 0.5), streamed=True)
+    pair.run(0.1)
+    pair.ask(ChangeSpeed(step))
+    pair.run(0.1)
+    pair.ask(Drive(Motion.LEFT, 0.5), streamed=True)
+    assert pair.sent[-1] == (pair.now, b"$3,0,0,0,0,0,0,0,0#")
+
+
+def test_drive_after_a_step_that_must_not_be_lost_says_how_long_it_waits() -> None:
+    pair = Pair("arduino", world=World.open_field())
+    pair.control = control(parse_platform("arduino"), speed_max=0.5)
+    pair.ready()
+    pair.run(10.0)
+    pair.ask(ChangeSpeed(SpeedStep.DOWN))
+    pair.run(0.1)
+    wait_s = pair.control.wait_s(Drive(Motion.FORWARD, 0.05), pair.now)
+    began = pair.now
+    assert f"{wait_s:.1f} s" in pair.ask(Drive(Motion.FORWARD, 0.05), identity="d").words
+    pair.until(lambda: Phase.SENT in pair.phases("d"), 2.0)
+    assert 0.5 < pair.now - began <= wait_s
+
+
 def test_no_drive_is_begun_after_a_release_during_steps_down() -> None:
     pair = _limited("arduino", 0.2)
     pair.run(10.0)
