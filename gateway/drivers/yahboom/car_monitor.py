@@ -85,6 +85,7 @@ class CarMonitor:
             return
         was_silent = self._silent_since is not None or model.trust.state is CarTrust.UNHEARD
         before, silent_s = model.mode.verdict, model.mode.unheard_s(event.at) if was_silent else 0.0
+        heard_at = model.mode.heard_at
         model.mode.on_reading(event, counts=is_credible)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
@@ -94,7 +95,7 @@ class CarMonitor:
             # Allow such a silence. Otherwise, if a `MODE00` delays the report for longer than expected, each silence
             # would cause the next `MODE00`, for ever.
             model.mode.allow_silence(silent_s)
-            self._on_contact(now)
+            self._on_contact(heard_at, now)
         finding = model.evidence.on_reading(event)
         if Blocking.MODE_CLOSE in model.learned.blocks and model.stop_style is StopStyle.TIMER:
             words = f"its reports come late after MODE00, unlike those of {model.profile.name} cars"
@@ -244,14 +245,18 @@ class CarMonitor:
             self._stops.recover(now, words)
         model.learn(TrustEvent.SILENT, now, words)
 
-    def _on_contact(self, now: float) -> None:
-        """Stop the car when it reports again, because a stuck link may deliver all frames of the silence at once."""
+    def _on_contact(self, heard_at: float, now: float) -> None:
+        """Stop the car when it reports again, because a stuck link may deliver all frames of the silence at once.
+
+        `heard_at` is the time of the last reading before the silence.
+        """
         words = f"{self.model.name} sends readings again. The gateway stops it first."
         self._log.log(Level.INFO, "answers_again", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self._executor.senders.halt_streams(now)
         self.model.learn(TrustEvent.HEARD, now, words)
         self.model.believed.allow_restart()
+        self._executor.allow_for_lost_steps(heard_at)
         self._stops.on_contact(now, words)
 
     def _log_contradiction(self, before: Verdict, now: float) -> None:

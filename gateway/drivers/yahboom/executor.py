@@ -33,6 +33,8 @@ LISTEN_LIMITS: Final = 2.0
 """A stream of actions waits for a report if none has come for this many times the silence that contradicts the mode."""
 NOTICE_S: Final = 2 * TICK_S
 """Maximum time until a silence is noticed: two ticks, because the ticks of a busy gateway come late."""
+STEPS_KEPT: Final = 20
+"""Number of steps of the speed that are remembered. From any speed to any other, no car needs more."""
 NO_REPEAT_S: Final = 2 * FLIGHT_S
 """Time before the end of a drive in which its motion is not repeated. An stm32 car needs 43 ms to send a
 report. If the repeated motion and the stop after it arrive in that time, the car loses the stop."""
@@ -53,6 +55,10 @@ class Executor(Driver):
         """When the frames of the last actions on parts of the car were written."""
         self._speeds_before_step: Speeds | None = None
         """The speeds before the last frame, if that was a step of the speed."""
+        self._steps_written: deque[tuple[float, Speeds]] = deque(maxlen=STEPS_KEPT)
+        """When the last steps of the speed were written, and the speeds before them."""
+        self._in_write: Frame | None = None
+        """The frame that `poll` last returned, until `on_written`."""
 
     @property
     def model(self) -> CarModel:
@@ -81,6 +87,7 @@ class Executor(Driver):
         model.link_reason = reason
         model.believed.repeat = False
         model.learn(TrustEvent.LINK_LOST, now, reason)
+        self.allow_for_lost_steps(model.mode.heard_at)
         self.mode_sent = self._source = None
         self.senders.halt_streams(now)  # a press from before the loss must not drive the car after it
         self.stops.link_down(reason, now, cause=cause)
@@ -377,13 +384,14 @@ class Executor(Driver):
         # A general frame also sets the fan. Except for the command to switch the fan, leave it as it is.
         if not (isinstance(source, Pending) and isinstance(source.command.what, Fan)):
             frame = self.model.believed.with_fan(frame)
+        self._in_write = frame
         return OutgoingFrame(frame, self.model.profile.encode(frame), why, by.command.id if by is not None else "")
 
     # ------------------------------------------------------------------ frames written
 
     def on_written(self, write: OutgoingFrame, now: float) -> None:
         """Update model and queue, because the frame that `poll` returned is written."""
-        source, self._source = self._source, None
+        source, self._source, self._in_write = self._source, None, None
         model, frame = self.model, write.frame
         if isinstance(frame, ModeClose):
             if not model.manual:
@@ -395,6 +403,8 @@ class Executor(Driver):
         model.pacing.on_written(frame, now)
         self._update_model(frame, now)
         self._allow_for_lost_step(frame, speeds, may_be_unread=may_be_unread)
+        if isinstance(frame, General) and frame.speed is not None:
+            self._steps_written.append((now, speeds))
         match source:
             case StopInProgress():
                 self._step_written(source, now)
@@ -426,6 +436,19 @@ class Executor(Driver):
         if may_be_unread and before is not None:
             self.model.believed.allow(before)
         self._speeds_before_step = speeds if is_step else None
+
+    def allow_for_lost_steps(self, since: float) -> None:
+        """Allow for a car that did not get the last steps of the speed: the link may have lost everything since then.
+
+        If the write of a step has failed, allow also for a car that got it.
+        """
+        believed, frame, self._in_write = self.model.believed, self._in_write, None
+        if isinstance(frame, General) and frame.speed is not None:
+            believed.allow(stepped(believed.speeds, frame.speed))
+        for at, speeds in self._steps_written:
+            if at >= since:
+                believed.allow(speeds)
+        self._steps_written.clear()
 
     def _step_written(self, running: StopInProgress, now: float) -> None:
         if running.on_step_written(now):

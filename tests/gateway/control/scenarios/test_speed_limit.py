@@ -259,6 +259,42 @@ def test_car_that_was_switched_off_behind_an_open_link_begins_with_its_own_speed
     assert _driven(pair) <= 0.4
 
 
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_steps_that_a_dead_link_has_lost_do_not_count(*, is_closed: bool) -> None:
+    """The car never got the steps, but the gateway counted them, and drove it as fast as before."""
+    pair = _limited("arduino", 1.0)
+    for _ in range(3):
+        pair.ask(ChangeSpeed(SpeedStep.UP))
+        pair.run(1.5)
+    _follow_with_another_gateway(pair, "arduino", 0.9)
+    pair.deaf_until = pair.now + 6.0
+    pair.lose_frames()
+    pair.ask(Drive(Motion.FORWARD, 0.5))
+    pair.run(5.0)
+    assert any(b"0,0,0,2,0" in frame for _, frame in pair.sent)
+    pair.pass_frames()
+    if is_closed:
+        pair.lose()
+        pair.run(2.0, linked=False)
+        pair.connect()
+    pair.run(15.0)
+    assert pair.car.truth.speed > 0.9 * FULL_PWM
+    assert 0.0 < _driven(pair) <= 0.9
+
+
+def test_step_up_whose_write_failed_may_have_arrived() -> None:
+    """The car went one step faster, the gateway did not count it, and accepted one step more than the limit allows."""
+    pair = _limited("arduino", 0.8)
+    pair.run(3.0)
+    pair.cut = len(b"$0,0,0,1,0,0,0,0,0#")  # the write failed, but the car got all of it
+    pair.ask(ChangeSpeed(SpeedStep.UP))
+    pair.run(2.0, linked=False)
+    pair.ready()
+    pair.ask(ChangeSpeed(SpeedStep.UP))
+    pair.run(3.0)
+    assert 0.0 < _driven(pair) <= 0.8
+
+
 def test_speeds_of_a_damaged_file_are_not_used() -> None:
     kept = control(parse_platform("arduino")).driver.kept()
     assert Learned.restore(kept).speeds == Learned().speeds
