@@ -484,7 +484,7 @@ class Controller(Generic[D_co]):
         if isinstance(command.what, SetMode):
             after = " after the actions that wait" if self.driver.queue.has_undelayed else ""
             return f"opens in {wait_s:.1f} s at most{after}: {self.car} is stopped first"
-        if words := self.driver.wait_words(now):
+        if words := self.driver.drive_wait_words(now):
             return f"begins after {words}"
         what = "a stop" if self.driver.is_stopping else "a command"
         return f"begins in {wait_s:.1f} s at most: {self.car} is busy with {what}"

@@ -417,6 +417,10 @@ class Driver(ABC):
         del now
         return ""
 
+    def drive_wait_words(self, now: float) -> str:
+        """Name what a drive waits for, if it waits for more than other commands do. Empty if at most for a stop."""
+        return self.wait_words(now)
+
     def drive_wait_s(self, busy_s: float, now: float) -> float:
         """Return the longest wait, in s, of a drive until its frame is written. `busy_s` is the wait for the car."""
         del now
@@ -576,7 +580,7 @@ class Driver(ABC):
                     words = f"began after {waited_s:.1f} s: {held.waited_for or f'{car} was busy'}"
                 self.release(Phase.COMPLETE, None, words, now)
             else:  # the frame of the drive could not be written in all that time
-                waited_s, waits = now - held.pending.received_at, self.wait_words(now)
+                waited_s, waits = now - held.pending.received_at, self.drive_wait_words(now)
                 words = f"{car} waits for {waits}" if waits else f"{car} was busy for {waited_s:.1f} s"
                 self.release(Phase.EXPIRED, Reason.EXPIRED, words, now)
         self.queue.expire(now)

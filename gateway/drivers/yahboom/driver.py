@@ -199,13 +199,13 @@ class YahboomDriver(Executor):
             words += ", as far as is known without its platform. Name it (`platform:` in the fleet file)"
         return f"{words}."
 
-    def wait_words(self, now: float) -> str:
-        """Return what a drive waits for, apart from stops and other commands. Empty if for nothing."""
-        del now
+    def drive_wait_words(self, now: float) -> str:
+        """Name the stop and the steps of the speed that a drive waits for. Empty if it waits for no step."""
         if not (steps := len(self.steps_before_drive)):
             return ""
         what = "a step" if steps == 1 else f"{steps} steps"
-        return f"{what} of its speed, because the maximum is {self.desk.speed_max:.0%} (speed_max)"
+        stop = "" if self.accepts_commands(now) else "a stop, and "
+        return f"{stop}{what} of its speed, because the maximum is {self.desk.speed_max:.0%} (speed_max)"
 
     def frames(self, what: Action) -> tuple[Frame | Later, ...]:
         """Return the frames of an action on a part of the car. Leave out those that the car does not understand."""

@@ -117,6 +117,19 @@ def test_drive_after_a_step_that_must_not_be_lost_says_how_long_it_waits() -> No
     assert 0.5 < pair.now - began <= wait_s
 
 
+def test_car_in_its_first_stop_waits_for_no_step_of_its_speed() -> None:
+    """`fleet list` blamed the speed, and did not say for how long, although only a drive needs the step."""
+    pair = Pair("arduino")
+    pair.control = control(parse_platform("arduino"), speed_max=0.4)
+    pair.connect()
+    pair.run(1.0)
+    assert pair.control.waits_for(pair.now).startswith("its first stop, for ")
+    answer = pair.ask(Drive(Motion.FORWARD, 0.5))
+    assert "a stop, and a step of its speed" in answer.words
+    pair.until(lambda: pair.control.is_free(pair.now), 10.0)
+    assert pair.control.waits_for(pair.now) == ""
+
+
 def test_no_drive_is_begun_after_a_release_during_steps_down() -> None:
     pair = _limited("arduino", 0.2)
     pair.run(10.0)
