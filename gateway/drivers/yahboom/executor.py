@@ -290,9 +290,23 @@ class Executor(Driver):
         return any(pending is not None and self._may_overtake(pending) for pending in waiting)
 
     def _actions_wait(self, now: float) -> bool:
-        """Return True if actions on parts of the car wait, because a stream of them is in the way of something else."""
-        waits = bool(self.queue.one_shots)
-        return waits and (self._stop_goes_first(now) or self._renewal_goes_first(now) or self._is_listening(now))
+        """Return True if actions on parts of the car wait, because they are in the way of something else."""
+        if not self.queue.one_shots:
+            return False
+        stops = self._soft_stop_goes_first(now) or self._stop_goes_first(now) or self._renewal_goes_first(now)
+        return stops or self._is_listening(now)
+
+    def _soft_stop_goes_first(self, now: float) -> bool:
+        """Return True if an action waits for the second frame of a soft stop, because the car may have lost the first.
+
+        The general frame of an action ends the motion just as well. But a color or an angle leaves the motors on, and
+        the second frame would have to wait until the car has read it.
+        """
+        running = self.stops.running
+        if running is None or not running.is_soft or running.index == 0 or running.frames_sent:
+            return False
+        pending = self.queue.next_part(now) if running.may_be_lost else None
+        return pending is not None and not isinstance(pending.next_frame, General)
 
     def _renewal_goes_first(self, now: float) -> bool:
         """Return True if a stream of actions has held up the renewal (repeat) of a stop that the car has not shown."""
@@ -407,6 +421,7 @@ class Executor(Driver):
             self._steps_written.append((now, speeds))
         match source:
             case StopInProgress():
+                source.may_be_lost = may_be_unread
                 self._step_written(source, now)
             case HeldMotion() if isinstance(frame, General) and frame.speed is not None:
                 source.waited_for = f"its speed was lowered to {model.believed.share:.0%} first (speed_max)"

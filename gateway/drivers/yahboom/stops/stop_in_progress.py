@@ -73,6 +73,8 @@ class StopInProgress(Struct):
     """When the first frame of the stop was written."""
     last_at: float = float("-inf")
     """When the last frame of the stop was written."""
+    may_be_lost: bool = False
+    """True if the car may have read the last frame of the stop behind another one, and ignored it."""
     other_at: float = float("-inf")
     """When the last frame of another command was written during the stop."""
     closed_at: float = float("-inf")

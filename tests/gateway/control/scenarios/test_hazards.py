@@ -15,6 +15,7 @@ from gateway.drivers.yahboom.protocol.frames import General, parse_sent
 from gateway.drivers.yahboom.stops import cases
 from gateway.drivers.yahboom.stops.cases import StopCase
 from gateway.sim.model.raspberry_pi import RaspberryPiCar, Transport
+from gateway.sim.model.world import World
 from schemas.words import Basis, Light, Mode, Motion, Phase, Reason
 from tests.gateway.sim.hazards import HAZARDS, Hazard
 from tests.gateway.sim.strangers import virtual
@@ -22,6 +23,8 @@ from tests.support.virtual import Pair
 
 RECOVERED_S = 7.3
 """Maximum time of recovery outside avoidance, in theory (docs/reference/protocol.md#stops)."""
+WORST_SOFT_S = 1.1 + 1.0 + 0.3
+"""Maximum time of the end of a drive: the second stop, behind a distance measurement, and the wire."""
 SETTLED_S = 12.0
 """Time in which every stop ends, and in which a car that drives on shows it."""
 
@@ -421,3 +424,21 @@ def dead_man(pair: Pair) -> None:
     asked_at = pair.now
     pair.run(SETTLED_S)
     assert asked_at < pair.off_for_good_at() <= asked_at + 0.5 + 0.1
+
+
+@pytest.mark.parametrize("period_s", [0.3, 0.5, 0.9])
+@pytest.mark.parametrize("phase", range(6))
+def test_colors_do_not_put_off_the_second_stop_of_a_drive(phase: int, period_s: float) -> None:
+    """Without an echo, the car lost the first stop behind the repeated motion, and drove on for up to 9.6 s."""
+    pair = Pair("arduino", seed=phase, world=World.open_field()).ready()
+    pair.run(3.0 + 0.17 * phase)
+    pair.ask(Drive(Motion.FORWARD, 1.6))
+    pair.run(1.6 + period_s)
+    ended_at, red = pair.now - period_s, 0
+    while pair.car.truth.driving:
+        assert pair.now < ended_at + WORST_SOFT_S
+        red += 1
+        pair.ask(Led(red, 0, 0))
+        pair.run(period_s)
+    pair.run(SETTLED_S)
+    assert pair.off_for_good_at() < ended_at + WORST_SOFT_S
