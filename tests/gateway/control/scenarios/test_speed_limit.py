@@ -130,6 +130,20 @@ def test_car_in_its_first_stop_waits_for_no_step_of_its_speed() -> None:
     assert pair.control.waits_for(pair.now) == ""
 
 
+def test_record_of_a_drive_says_that_its_speed_was_lowered_and_not_that_the_car_was_busy() -> None:
+    """Also if the drive was requested again, when its speed had been lowered already."""
+    pair = _limited("raspberry_pi", 0.3)
+    pair.run(10.0)
+    for identity in ("first", "again"):
+        pair.ask(Drive(Motion.FORWARD, 0.5), identity=identity)
+        pair.run(0.06)
+    pair.run(5.0)
+    said = [record.words for record in pair.records if record.command.id == "again" and record.phase is Phase.SENT]
+    assert len(said) == 2
+    assert all("its speed was lowered to 20% first" in words for words in said)
+    assert not any("busy" in words for words in said)
+
+
 def test_no_drive_is_begun_after_a_release_during_steps_down() -> None:
     pair = _limited("arduino", 0.2)
     pair.run(10.0)
