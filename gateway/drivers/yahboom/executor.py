@@ -297,16 +297,25 @@ class Executor(Driver):
         return stops or self._is_listening(now)
 
     def _soft_stop_goes_first(self, now: float) -> bool:
-        """Return True if an action waits for the second frame of a soft stop, because the car may have lost the first.
+        """Return True if an action waits for a soft stop: the car may have lost its first frame, or not read the last.
 
         The general frame of an action ends the motion just as well. But a color or an angle leaves the motors on, and
-        the second frame would have to wait until the car has read it.
+        a car that reads it in one string with a stop ignores the stop.
         """
         running = self.stops.running
-        if running is None or not running.is_soft or running.index == 0 or running.frames_sent:
+        if running is None or not running.is_soft or running.index == 0:
             return False
-        pending = self.queue.next_part(now) if running.may_be_lost else None
+        if not (running.may_be_lost and not running.frames_sent) and now >= self._soft_stop_read_at:
+            return False
+        pending = self.queue.next_part(now)
         return pending is not None and not isinstance(pending.next_frame, General)
+
+    @property
+    def _soft_stop_read_at(self) -> float:
+        """Return when the car has read the last frame of the running soft stop, or -inf if another frame followed."""
+        running, pacing = self.stops.running, self.model.pacing
+        is_last = running is not None and running.is_soft and running.last_at == pacing.written_at
+        return pacing.buffer_until if is_last else float("-inf")
 
     def _renewal_goes_first(self, now: float) -> bool:
         """Return True if a stream of actions has held up the renewal (repeat) of a stop that the car has not shown."""
@@ -619,6 +628,8 @@ class Executor(Driver):
             )
         if queue.held is not None and not queue.held.pending.sent and self._may_overtake(queue.held.pending):
             times.append(max(self._drive_at, free_at))
+        if actions_wait and self._soft_stop_read_at > now:
+            times.append(self._soft_stop_read_at)
         change = self._next_mode
         if change is not None:
             opens = model.rest_is_sure or self._full_stop_runs

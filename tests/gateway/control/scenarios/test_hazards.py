@@ -426,15 +426,16 @@ def dead_man(pair: Pair) -> None:
     assert asked_at < pair.off_for_good_at() <= asked_at + 0.5 + 0.1
 
 
+@pytest.mark.parametrize("drive_s", [0.3, 1.6, 2.5])
 @pytest.mark.parametrize("period_s", [0.3, 0.5, 0.9])
-@pytest.mark.parametrize("phase", range(6))
-def test_colors_do_not_put_off_the_second_stop_of_a_drive(phase: int, period_s: float) -> None:
-    """Without an echo, the car lost the first stop behind the repeated motion, and drove on for up to 9.6 s."""
+@pytest.mark.parametrize("phase", range(10))
+def test_colors_do_not_put_off_the_stop_of_a_drive(phase: int, period_s: float, drive_s: float) -> None:
+    """Without an echo, the car lost the stop behind the repeated motion, or before a color, and drove on for 9.8 s."""
     pair = Pair("arduino", seed=phase, world=World.open_field()).ready()
     pair.run(3.0 + 0.17 * phase)
-    pair.ask(Drive(Motion.FORWARD, 1.6))
-    pair.run(1.6 + period_s)
-    ended_at, red = pair.now - period_s, 0
+    pair.ask(Drive(Motion.FORWARD, drive_s))
+    pair.run(drive_s + 0.13)
+    ended_at, red = pair.now, 110
     while pair.car.truth.driving:
         assert pair.now < ended_at + WORST_SOFT_S
         red += 1
