@@ -63,7 +63,7 @@ def test_level_without_a_name_does_not_end_the_process(tmp_path: Path) -> None:
     # Rerun would abort the process of the tests.
     program = "import sys; from fleet.__main__ import main; sys.exit(main())"
     save = ["replay", str(path), "--save", str(path.with_suffix(".rrd"))]
-    done = subprocess.run([sys.executable, "-c", program, *save], capture_output=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, "-c", program, *save], capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
     assert rrd_export.rows(path.with_suffix(".rrd")) == {LOG: 2}
 

@@ -284,7 +284,7 @@ def test_export_on_full_disk_fails_in_our_words(
         f"resource.setrlimit(resource.RLIMIT_FSIZE, ({2 * len(data)}, {2 * len(data)})); main()"
     )
     command = [sys.executable, "-c", code, "replay", str(source), "--save", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     said = done.stderr.splitlines()
     assert len(said) == 1 + damaged, done.stderr
