@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +73,14 @@ def debian() -> Path:
     return IMAGE
 
 
+def first_process(container: int) -> int | None:
+    """Return the id of systemd in the container. Before it, there are processes that only prepare the container."""
+    with suppress(psutil.NoSuchProcess):
+        started = psutil.Process(container).children(recursive=True)
+        return next((each.pid for each in started if each.name() == "systemd"), None)
+    return None
+
+
 @pytest.fixture
 def computer(debian: Path, tmp_path: Path) -> Iterator[Debian]:
     """Boot it. What it writes is in memory, and gone with it."""
@@ -94,8 +103,7 @@ def computer(debian: Path, tmp_path: Path) -> Iterator[Debian]:
             env=environment,
         )
     try:
-        (first,) = wait_for(lambda: psutil.Process(container.pid).children(), "systemd starts", BOOT_S)
-        made = Debian(first.pid)
+        made = Debian(wait_for(lambda: first_process(container.pid), "systemd starts", BOOT_S))
         booted = ("running", "degraded")  # the second one if a unit of Debian's own cannot run in a container
         wait_for(lambda: made.run("systemctl", "is-system-running", ok=False) in booted, "it has booted", BOOT_S)
         yield made
