@@ -53,8 +53,6 @@ class Executor(Driver):
         """The stop, motion or command of the frame that `poll` last returned. None for a repetition."""
         self._action_times: deque[float] = deque(maxlen=FREE_ACTIONS)
         """When the frames of the last actions on parts of the car were written."""
-        self._speeds_before_step: Speeds | None = None
-        """The speeds before the last frame, if that was a step of the speed."""
         self._steps_written: deque[tuple[float, Speeds]] = deque(maxlen=STEPS_KEPT)
         """When the last steps of the speed were written, and the speeds before them."""
         self._in_write: Frame | None = None
@@ -203,6 +201,13 @@ class Executor(Driver):
         """
         ready_at, buffer_until = self.model.ready_at, self.model.pacing.buffer_until
         return max(ready_at, buffer_until) if self._is_too_fast or self._must_not_lose_step else ready_at
+
+    @property
+    def _speeds_before_step(self) -> Speeds | None:
+        """The speeds before the last frame, if that was a step of the speed."""
+        if not self._steps_written or self._steps_written[-1][0] != self.model.pacing.written_at:
+            return None
+        return self._steps_written[-1][1]
 
     @property
     def _must_not_lose_step(self) -> bool:
@@ -422,17 +427,21 @@ class Executor(Driver):
                 deaf_until = max(now, model.pacing.block_until) + model.for_stop(now).turn_s
                 model.mode_closed_at, model.mode_left_by = now, deaf_until + model.profile.block_s(frame) + FLIGHT_S
             model.evidence.on_mode_00(now, awake=model.is_awake(now))
-        may_be_unread, speeds = now < model.pacing.buffer_until, model.believed.speeds
+        is_step = isinstance(frame, General) and frame.speed is not None
+        speeds, may_be_unread = model.believed.speeds, now < model.pacing.buffer_until
+        # A car that reads this frame together with the one before it may ignore one of them.
+        lost = (speeds if is_step else self._speeds_before_step) if may_be_unread else None
         model.pacing.on_written(frame, now)
         self._update_model(frame, now)
-        self._allow_for_lost_step(frame, speeds, may_be_unread=may_be_unread)
-        if isinstance(frame, General) and frame.speed is not None:
+        if lost is not None:
+            model.believed.allow(lost)
+        if is_step:
             self._steps_written.append((now, speeds))
         match source:
             case StopInProgress():
                 source.may_be_lost = may_be_unread
                 self._step_written(source, now)
-            case HeldMotion() if isinstance(frame, General) and frame.speed is not None:
+            case HeldMotion() if is_step:
                 source.waited_for = f"its speed was lowered to {model.believed.share:.0%} first (speed_max)"
             case HeldMotion():
                 source.begin(now, model.range_cm)
@@ -449,17 +458,6 @@ class Executor(Driver):
                 self.queue.on_part_written(source, now)
             case None:
                 model.believed.repeat = False
-
-    def _allow_for_lost_step(self, frame: Frame, speeds: Speeds, *, may_be_unread: bool) -> None:
-        """Allow for a car that has ignored a step of the speed, because it read two frames at once.
-
-        `may_be_unread` is about the frame before this one, and `speeds` are those before this one.
-        """
-        is_step = isinstance(frame, General) and frame.speed is not None
-        before = speeds if is_step else self._speeds_before_step
-        if may_be_unread and before is not None:
-            self.model.believed.allow(before)
-        self._speeds_before_step = speeds if is_step else None
 
     def allow_for_lost_steps(self, since: float) -> None:
         """Allow for a car that did not get the last steps of the speed: the link may have lost everything since then.
