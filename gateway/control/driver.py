@@ -508,7 +508,7 @@ class Driver(ABC):
         model = self.model
         changed = model.battery.on_voltage(voltage_v, loaded=model.motors is not Motors.OFF, now=now)
         if refusal := model.battery.refusal:
-            self._reject_waiting(Reason.BATTERY_LOW, refusal, now)
+            self._reject_waiting(refusal, now)
         if not changed:
             return
         level, words = model.battery.level, f"{model.name}: {model.battery.words}"
@@ -518,12 +518,12 @@ class Driver(ABC):
             self.halt(words, now)
             self.stop_if_open(now)
 
-    def _reject_waiting(self, reason: Reason, words: str, now: float) -> None:
-        """Reject the drive and the mode that were accepted but still wait, because the car must not begin them now."""
+    def _reject_waiting(self, words: str, now: float) -> None:
+        """Reject the drive and the mode that were accepted but still wait: the battery is too low to begin them."""
         held = self.queue.held
         if held is not None and held.began_at is None:
-            self.release(Phase.REJECTED, reason, words, now)
-        self.queue.close_mode_change(Phase.REJECTED, reason, words, now)
+            self.release(Phase.REJECTED, Reason.BATTERY_LOW, words, now)
+        self.queue.close_mode_change(Phase.REJECTED, Reason.BATTERY_LOW, words, now)
 
     def halt(self, words: str, now: float, by: str = "") -> None:
         """Drop all commands, and shorten the lease. Refuse the drives of each sender that has just driven.

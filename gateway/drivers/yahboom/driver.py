@@ -33,26 +33,17 @@ from gateway.drivers.yahboom.executor import Executor
 from gateway.drivers.yahboom.protocol.frame_splitter import FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import ArmSet, ColorLed, Frame, General, ModeOpen, Ptz
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
-from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.platforms import CAMERA_TURNS, Profile
 from gateway.drivers.yahboom.protocol.timing import SERVO_S
 from gateway.drivers.yahboom.protocol.wire_events import Event as WireEvent
 from schemas.commands import Verb
-from schemas.words import Mode, Motion, Platform, Reason, ServoAction, SpeedStep
+from schemas.words import Mode, Motion, Platform, Reason, SpeedStep
 
 STALE_TIMES_S: Final = 0.5
 """Maximum stall of our loop after which the times of reports still count. A stop delays the reports of a car, and this
 shows that it arrived. After a longer stall, a report that we have read late looks like such a delay."""
 CAMERA_STEP_S: Final = SERVO_S
 """How long a servo of a Raspberry Pi car's camera turns for one command. The car may be busy with it for so long."""
-CAMERA_TURNS: Final = frozenset(
-    (
-        ServoAction.VERTICAL_UP,
-        ServoAction.VERTICAL_DOWN,
-        ServoAction.HORIZONTAL_LEFT,
-        ServoAction.HORIZONTAL_RIGHT,
-    )
-)
-"""Movements that last until the next general frame, or to the end of the servo (docs/reference/protocol.md)."""
 
 
 class YahboomDriver(Executor):

@@ -28,13 +28,12 @@ from typing import Final
 
 from gateway.drivers.yahboom.estimate.learned import Learned, blocking_kind
 from gateway.drivers.yahboom.protocol.frames import ArmSet, Frame, General, LoneHash
-from gateway.drivers.yahboom.protocol.platforms import Profile
+from gateway.drivers.yahboom.protocol.platforms import FRONT_SERVO, Profile
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
-from schemas.words import Platform, ServoAction
+from schemas.words import Platform
 
 FLIGHT_S: Final = 0.06
 """Minimum time of a frame's flight. A longer block counts instead (docs/reference/protocol.md#pacing)."""
-FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 AWAKE_S: Final = 0.6
 """Maximum time after a report during which the car reads a frame at once. One interval after the report, it ranges."""
 LINK_DELAY_S: Final = 0.3

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field
 from msgspec.structs import replace
 
 from gateway.drivers.yahboom.protocol.frames import ColorLed, Frame, General, ModeClose, ModeOpen, Ptz
-from gateway.drivers.yahboom.protocol.platforms import SPEEDS, Profile, SpeedModel
-from schemas.words import Mode, Motion, Platform, ServoAction, SpeedStep
+from gateway.drivers.yahboom.protocol.platforms import FRONT_SERVO, SPEEDS, Profile, SpeedModel
+from schemas.words import Mode, Motion, Platform, SpeedStep
 
-_FRONT_STEPS = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 # The car looks around in avoidance, and sweeps in color LED mode. In remote control, a person may turn the servo.
 _TURN_SERVO = frozenset({Mode.REMOTE_CONTROL, Mode.OBSTACLE_AVOIDANCE, Mode.COLOR_LED})
 
@@ -71,7 +70,7 @@ class StateEstimate:
                 if frame.motion is not Motion.STOP:
                     self.repeat = self.repeat or frame.motion is not self.motion
                 self.motion = frame.motion
-                if frame.servo in _FRONT_STEPS:
+                if frame.servo in FRONT_SERVO:
                     self.servo_deg = None
                 if frame.speed is not None:
                     self.speeds = stepped(self.speeds, frame.speed)

@@ -52,11 +52,13 @@ class StopStyle(StrEnum):
     """Both kinds of frames, because readings contradict the platform."""
 
 
-_FRONT: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
+FRONT_SERVO: Final = frozenset({ServoAction.FRONT_LEFT, ServoAction.FRONT_RIGHT, ServoAction.FRONT_RESET})
 _VERTICAL: Final = frozenset({ServoAction.VERTICAL_UP, ServoAction.VERTICAL_DOWN, ServoAction.VERTICAL_RESET})
 _HORIZONTAL: Final = frozenset(
     {ServoAction.HORIZONTAL_LEFT, ServoAction.HORIZONTAL_RIGHT, ServoAction.HORIZONTAL_RESET}
 )
+CAMERA_TURNS: Final = (_VERTICAL | _HORIZONTAL) - {ServoAction.VERTICAL_RESET, ServoAction.HORIZONTAL_RESET}
+"""Movements that last until the next general frame, or to the end of the servo (docs/reference/protocol.md)."""
 
 
 class SpeedModel(Struct, frozen=True):
@@ -332,7 +334,7 @@ class Profile(Struct, frozen=True, dict=True):
         if self.constants and self._may_be_constant(event):
             names -= {name for name, value in self.constants if getattr(event, ATTRIBUTES[name]) == value}
         is_stm32 = may_be_stm32 or self.kind is Platform.STM32
-        if is_stm32 and candidate_modes(event) == (Mode.MANUAL,) and _stm32_constants(event):
+        if is_stm32 and candidate_modes(event) == (Mode.MANUAL,) and stm32_constants(event):
             names -= _STM32_CONSTANTS
         return frozenset(names - self._out_of_range(event))
 
@@ -452,7 +454,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _ALL_MODES,
                 _MODE_CAR | parts,
                 _ALL_LIGHTS,
-                _FRONT,
+                FRONT_SERVO,
                 StopStyle.MODE_FRAME,
             )
         case Platform.STM32:
@@ -462,7 +464,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _ALL_MODES,
                 _STM32_CAR | parts,
                 _STM32_LIGHTS,
-                _FRONT,
+                FRONT_SERVO,
                 StopStyle.TIMER,
                 not_observed=("the slowest speed", "readings while the fan runs"),
             )
@@ -473,7 +475,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _MODE_0,
                 _PI_CAR | parts,
                 _LIGHTS_2_TO_4,
-                _FRONT | _VERTICAL | _HORIZONTAL,
+                FRONT_SERVO | _VERTICAL | _HORIZONTAL,
                 StopStyle.GENERAL,
                 constants=_CONSTANTS,
                 not_observed=("the speed at the start",),
@@ -485,7 +487,7 @@ def _profile(kind: Platform, options: frozenset[str]) -> Profile:
                 _MODE_0,
                 _EVERY_CAR | parts,
                 _LIGHTS_2_TO_4,
-                _FRONT,
+                FRONT_SERVO,
                 StopStyle.GENERAL,
                 constants=_CONSTANTS,
                 not_observed=("only what every known platform has is used",),
@@ -497,7 +499,8 @@ def whole_cm(event: Sensors) -> bool:
     return b"." not in event.raw.partition(b",PV")[0]
 
 
-def _stm32_constants(event: Sensors) -> bool:
+def stm32_constants(event: Sensors) -> bool:
+    """Return True if grayscale, line, obstacle and light are the constants of one stm32 program."""
     return b",GS0,LF0000,HW00,GM00" in event.raw
 
 
