@@ -19,7 +19,8 @@ from gateway import drivers
 from gateway.drivers.yahboom.protocol.frame_splitter import ECHO_S, MAX_FRAME, FrameSplitter
 from gateway.drivers.yahboom.protocol.frames import STANDARD_HEAD
 from gateway.drivers.yahboom.protocol.measurements import measured, verdict_of
-from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform
+from gateway.drivers.yahboom.protocol.platforms import Profile, parse_platform, stm32_constants
+from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.protocol.wire_events import Event
 from schemas.words import FrameVerdict, Mode, Platform
 
@@ -128,12 +129,11 @@ class Redecoding(Struct):
         modes = [each.mode for each in _around(self._modes, frame.at_ns, MAX_MODE_DELAY_NS)] or [None]
         found: list[Outcome] = []
         decoded = _decode(self._decoder, frame.data, at)
-        for events, profile, mode, is_open in product(decoded, profiles, dict.fromkeys(modes), (False, True)):
-            outcome = _outcome(
-                events, profile, mode, may_be_stm32=is_open and profile.kind is not Platform.RASPBERRY_PI
-            )
-            if outcome not in found:
-                found.append(outcome)
+        for events, profile, mode in product(decoded, profiles, dict.fromkeys(modes)):
+            for may_be_stm32 in (False, True) if _may_have_constants(events, profile) else (False,):
+                outcome = _outcome(events, profile, mode, may_be_stm32=may_be_stm32)
+                if outcome not in found:
+                    found.append(outcome)
         if (
             frame.verdict == FrameVerdict.ECHO
             and at < ECHO_S
@@ -188,6 +188,13 @@ def _decode(decoder: FrameSplitter, data: bytes, at: float) -> list[tuple[Event,
         decoder.end()
         found.append(more)
     return found
+
+
+def _may_have_constants(events: Iterable[Event], profile: Profile) -> bool:
+    """Return True if the gateway may have taken values of these events for the constants of an stm32 program."""
+    if profile.kind is Platform.RASPBERRY_PI:
+        return False
+    return any(isinstance(event, Sensors) and stm32_constants(event) for event in events)
 
 
 def _outcome(events: Iterable[Event], profile: Profile, mode: Mode | None, *, may_be_stm32: bool) -> Outcome:
