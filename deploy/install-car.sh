@@ -278,11 +278,12 @@ if has_systemd; then
     [ -z "$car" ] || systemctl start --no-block "car-gateway@$car.service"
 fi
 
+as_user="sudo -u $user env -C $state FLEET_STATE_DIR=$state $opt/bin/fleet"
 echo "Installed $("$opt/bin/gateway" --version), $(du -sm "$opt" | cut -f 1) MB in $opt."
 if [ -n "$car" ]; then
     echo "The hub's computer invites it with: fleet hub invite --car $car"
     echo "Then join here:"
-    echo "  sudo -u $user env -C $state FLEET_STATE_DIR=$state $opt/bin/fleet join HOST CODE"
+    echo "  $as_user join HOST CODE"
     echo "  sudo systemctl restart car-gateway@$car"
 fi
 if [ -n "$all" ]; then
@@ -290,6 +291,6 @@ if [ -n "$all" ]; then
     echo "  sudo systemctl enable --now car-hub-certificates.service car-hub-certificates.timer car-hub.service"
     echo "  sudo systemctl enable --now car-recorder.service car-console.service car-exporter.service"
     echo "Then let others join, and pair a device with the page:"
-    echo "  sudo -u $user env -C $state FLEET_STATE_DIR=$state $opt/bin/fleet hub invite NAME"
-    echo "  sudo -u $user env -C $state FLEET_STATE_DIR=$state $opt/bin/fleet console pair NAME"
+    echo "  $as_user hub invite NAME"
+    echo "  $as_user console pair NAME"
 fi
