@@ -566,15 +566,15 @@ class Console:
             self._end_all(theirs, "The car is in a mode.")
         self._count(page, page.operator.command(request, cars, answer))
 
-    def is_late(self, tick: str) -> bool:
+    def is_late(self, tick: int | None) -> bool:
         """Return True if a page pressed something so long ago that nobody expects its effect any more.
 
         A link that recovers delivers what was pressed while it hung. What names no tick has no age.
         """
-        return tick.isdecimal() and self._presses.is_late(int(tick[:16]), time.monotonic())
+        return tick is not None and self._presses.is_late(tick, time.monotonic())
 
     def _is_late(self, message: PageMessage) -> bool:
-        return "n" in message.fields and self.is_late(str(message.number("n")))
+        return self.is_late(message.number("n") if "n" in message.fields else None)
 
     def _command_refusal(self, page: PageLink, cars: Sequence[str], now: float) -> str:
         """Count a command to these cars. Return why it must not be sent, or an empty text if it may be."""

@@ -243,7 +243,8 @@ def _app(console: Console, lan: "Lan | None", more: Sequence[Route] = ()) -> App
         person = request.scope.get(PERSON)
         if words := console.management_refusal(person):
             return JSONResponse({"ok": False, "words": words}, 403)
-        if console.is_late(request.query_params.get("n", "")):
+        tick = request.query_params.get("n", "")
+        if console.is_late(int(tick[:16]) if tick.isdecimal() else None):
             return JSONResponse({"ok": False, "words": TOO_LATE}, 408)
         return await _answer_plan(request, console, console.plan.set_plan)
 
