@@ -7,13 +7,14 @@ last claims of a gateway that has ended are shown as past ones, with their age, 
 Lists, status, shutdown, doctor, console and Python all use these texts, so that a car is described everywhere alike.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isinf
 from typing import Any, Final
 
 from msgspec import Struct
 
 from schemas import topics
+from schemas.keys import name_of
 from schemas.words import UNKNOWN, Basis, Motors
 
 STOPPED: Final = "stopped"
@@ -122,6 +123,17 @@ def describe_age(age_s: float) -> str:
     if age_s < 120:
         return f"{age_s:.0f} s"
     return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
+
+
+def describe_bars(estops: Sequence[str], hold: str, paused_by: str, lent_to: str) -> str:
+    """Return what keeps a car from driving, for a cell of a table. Empty if nothing does.
+
+    `estops` are ids. `hold` is a text about the hold, `paused_by` the sender of the pause, `lent_to` a person; each is
+    empty if there is none. A hold is left out beside an e-stop, which is stronger.
+    """
+    stopped = f"e-stop {' '.join(estops)}" if estops else hold
+    paused, lent = paused_by and f"paused by {name_of(paused_by)}", lent_to and f"lent to {lent_to}"
+    return ", ".join(filter(None, (stopped, paused, lent)))
 
 
 def _claim(topic: str, age_s: float, what: str, basis: str, since_s: float | None, why: str) -> CarClaim:

@@ -11,7 +11,7 @@ import click
 from fleet.client import history_query
 from fleet.client.car_evidence import clocks_off, newest_states
 from fleet.client.car_state import CarState
-from fleet.client.claims import describe_end_of_doubt
+from fleet.client.claims import describe_bars, describe_end_of_doubt
 from fleet.client.client import Fleet
 from fleet.client.condition import KeyCondition, check_key, topics_under
 from fleet.client.gateway_clock import describe_clock
@@ -179,12 +179,8 @@ def cell_text(name: str, row: Mapping[str, Any]) -> str:
         age = f", {row['battery_age_s']:.0f} s old" if "sensor/battery" in row["stale"] else ""
         return f"{row['battery_v']:.2f} V {row['battery_level']}{age}"
     if name == "hold":
-        hold = f"e-stop {' '.join(row['estops'])}" if row["estops"] else keys.name_of(row["hold"] or "")
-        paused, lent = row["paused"], row["lent"]
-        return (
-            ", ".join(filter(None, (hold, paused and f"paused by {keys.name_of(paused)}", lent and f"lent to {lent}")))
-            or "-"
-        )
+        hold = keys.name_of(row["hold"] or "")
+        return describe_bars(row["estops"], hold, row["paused"] or "", row["lent"] or "") or "-"
     if name == "driver" and row["driver"]:
         return f"{keys.name_of(row['driver'])} ({row['driver_kind']})"
     if name == "platform" and row["platform_contradictions"]:

@@ -2,7 +2,7 @@
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from rich.console import Console, Group
@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.table import Table as Grid
 from rich.text import Text
 
-from fleet.client.claims import describe_age
+from fleet.client.claims import describe_age, describe_bars
 from fleet.column_widths import fit_columns
 from fleet.supervisor.car_status import CarStatus
 from schemas.keys import name_of
@@ -108,16 +108,11 @@ class Table:
             self._broken = True
 
 
-def _holders(safety: Any) -> Iterator[str]:
-    """Yield who keeps the car from driving, as `fleet list` does."""
-    if safety.estops:
-        yield f"e-stop {' '.join(each.id for each in safety.estops)}"
-    elif safety.HasField("hold"):
-        yield f"hold {name_of(safety.hold.by)}"
-    if safety.pauses:
-        yield f"paused by {name_of(binding_pause(safety.pauses).by)}"
-    if safety.HasField("loan"):
-        yield f"lent to {safety.loan.to}"
+def _bars(safety: Any) -> str:
+    """Return what keeps the car from driving. Unlike that of `fleet list`, this column also has who drives."""
+    hold = f"hold {name_of(safety.hold.by)}" if safety.HasField("hold") else ""
+    paused_by = binding_pause(safety.pauses).by if safety.pauses else ""
+    return describe_bars([each.id for each in safety.estops], hold, paused_by, safety.loan.to)
 
 
 def _cells(row: CarStatus, process: str, color: str, now: float) -> list[Text]:
@@ -126,7 +121,7 @@ def _cells(row: CarStatus, process: str, color: str, now: float) -> list[Text]:
     claims = state.claims(now)
     link = process if process or not state.link.state else state.link.state
     old = f" ({describe_age(state.age_s('state/link', now))} old)" if not process and claims.link.is_stale else ""
-    held = "" if safety is None else ", ".join(_holders(safety))
+    held = "" if safety is None else _bars(safety)
     volts = "" if battery is None else f"{battery.voltage_v:.2f} V"
     if state.is_stale("sensor/battery", now) and battery is not None:
         volts += f", {describe_age(state.age_s('sensor/battery', now))} old"
