@@ -2,7 +2,9 @@
 
 import gc
 import logging
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -10,6 +12,9 @@ from xdist.remote import Producer
 
 from tests.support import scheduling
 from tests.support.signals import give_default_signals
+
+if TYPE_CHECKING:
+    from tests.support.processes import FleetProcesses
 
 # By default, Hypothesis fails an example that takes 200 ms, and a test whose examples take a second to generate. A
 # stall of the machine is no fault of the product. pytest's timeout ends an endless example.
@@ -69,3 +74,14 @@ def pytest_runtest_teardown() -> None:
     """Enable logging again, which the completion of a shell disables for the rest of its process."""
     if logging.root.manager.disable:  # to set it costs each test a look at each logger
         logging.disable(logging.NOTSET)
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> "Iterator[FleetProcesses]":
+    """Start a hub for the processes of one test, and end them all."""
+    from tests.support.ports import free_endpoint  # here, because most tests need no process
+    from tests.support.processes import FleetProcesses
+
+    started = FleetProcesses(free_endpoint(), tmp_path)
+    yield started
+    started.close()

@@ -4,7 +4,6 @@ import contextlib
 import json
 import socket
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +11,7 @@ import pytest
 
 from schemas.words import Basis, Motors, Phase, Reason
 from tests.support.driver_package import install_driver
-from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
-
-
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
-    made = FleetProcesses(free_endpoint(), tmp_path)
-    yield made
-    made.close()
 
 
 def test_rover_drives_shows_stop_and_publishes_measurements(fleet: FleetProcesses) -> None:

@@ -24,13 +24,6 @@ def car() -> Iterator[TcpCar]:
     car.close()
 
 
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
-    fleet = FleetProcesses(free_endpoint(), tmp_path)
-    yield fleet
-    fleet.close()
-
-
 async def test_reports_that_a_stalled_loop_reads_late_show_no_stop(
     fleet: FleetProcesses, car: TcpCar, tmp_path: Path
 ) -> None:

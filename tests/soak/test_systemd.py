@@ -16,7 +16,6 @@ import psutil
 import pytest
 
 from tests.deploy.test_install_car import SCRIPT
-from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, driving, wait_for
 
 pytestmark = [pytest.mark.soak, pytest.mark.timeout(1200)]
@@ -110,13 +109,6 @@ def computer(debian: Path, tmp_path: Path) -> Iterator[Debian]:
     finally:
         container.terminate()
         container.wait()
-
-
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
-    fleet = FleetProcesses(free_endpoint(), tmp_path)
-    yield fleet
-    fleet.close()
 
 
 def test_gateway_is_started_again_and_stops_its_car(computer: Debian, fleet: FleetProcesses) -> None:

@@ -1,13 +1,11 @@
 """`fleet play` refuses in words what Zenoh cannot carry, and plays the rest. Zenoh's library panics on some of it."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from fleet.replay.player.player import MAX_ENCODING_BYTES, MAX_KEY_BYTES, is_carried
 from schemas import bus
-from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 from tests.support.random_session import RANGE, Mixed
 
@@ -16,13 +14,6 @@ BAD_KEYS = (
     "fleet/red/sensor/a#b", "fleet/red/a?b", "fleet/red/a*", "fleet/red/$x", "fleet/red//x", "fleet/red/x/",
     "fleet/a#b/x", "fleet/red/" + "x" * MAX_KEY_BYTES,
 )  # fmt: skip
-
-
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
-    started = FleetProcesses(free_endpoint(), tmp_path)
-    yield started
-    started.close()
 
 
 def test_uncarriable_messages_are_refused_and_rest_is_played(fleet: FleetProcesses, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 import json
 import random
 import signal
-from collections.abc import Iterator
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -24,18 +23,10 @@ from fleet.replay.player.schedule import Schedule
 from schemas import bus
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.fleet.replay.make_session import START_NS, Made, make
-from tests.support.ports import free_endpoint
 from tests.support.processes import PATIENCE_S, FleetProcesses, GatewayProcess, wait_for
 from tests.support.text_parts import has_parts
 
 S = 1_000_000_000
-
-
-@pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[FleetProcesses]:
-    started = FleetProcesses(free_endpoint(), tmp_path)
-    yield started
-    started.close()
 
 
 class InOrder(Writer):
