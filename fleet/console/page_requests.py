@@ -102,10 +102,9 @@ class PageMessage(Struct, frozen=True):
         Raises BadPageMessage if no name is left.
         """
         value = self.fields.get("cars")
-        names = (
-            [each for each in value if isinstance(each, str) and keys.is_name(each)] if isinstance(value, list) else []
-        )
-        return PageMessage({"cars": list(dict.fromkeys(names))[:MAX_CARS] or value}).cars()
+        listed = value if isinstance(value, list) else []
+        names = dict.fromkeys(each for each in listed if isinstance(each, str) and keys.is_name(each))
+        return tuple(names)[:MAX_CARS] or self.cars()
 
     def motion(self) -> str:
         """Return a motion that moves the car. Raises BadPageMessage."""
