@@ -34,7 +34,7 @@ class HeldMotion(Struct):
     range_cm: float | None = None
     """The last distance (in cm) that was measured before that frame was written. None if it is not known."""
     waited_for: str = ""
-    """What else than other commands had to be done before that frame, in words. Empty if nothing."""
+    """Why the drive had to wait for more than other commands, as a text for a person. Empty if it had not to."""
 
     @property
     def sender(self) -> Sender:

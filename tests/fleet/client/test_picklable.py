@@ -1,4 +1,4 @@
-"""What the SDK returns and raises can be returned by another process."""
+"""Another process can return the readings and errors of the SDK."""
 
 import pickle
 from concurrent.futures import ProcessPoolExecutor

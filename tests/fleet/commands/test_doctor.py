@@ -167,7 +167,7 @@ def test_why_did_red_not_stop_at_that_time(session: Path, tmp_path: Path) -> Non
 
 
 def test_why_tells_backfilled_messages_in_their_order(tmp_path: Path) -> None:
-    """What a recorder has missed, as during a restart of the hub, stands in the file where it was received."""
+    """A recorder writes messages that it has missed, as during a restart of the hub, when it receives them."""
     path = tmp_path / "sessions" / "20261125T120000Z-lab"
     path.mkdir(parents=True)
     recording = _Recording(path / "0001.mcap")

@@ -99,7 +99,7 @@ SPEEDS: Final[Mapping[Platform, SpeedModel]] = {
     # one is assumed, so that no car exceeds `speed_max`
     Platform.RASPBERRY_PI: SpeedModel(start=80, increment=20, low=20, rebound=20, top=100, set_by=frozenset()),
 }
-"""What each kind of program does with the speed. While the platform is unknown, the fastest of them counts."""
+"""The speeds and steps of each kind of program. While the platform is unknown, the fastest of them counts."""
 
 # platforms: constants in mode 0 of raspberry_pi: `PV8.4`, `GS0`, whole centimeters
 _PI_VOLTAGE_V, _PI_GRAYSCALE = 8.4, 0

@@ -11,7 +11,7 @@ from tests.support.virtual import Pair
 STEP_DEG = PAN_TILT_DEG_S * CAMERA_STEP_S
 """The angle of one step in the simulator."""
 LATE_DEG = 5.0
-"""What the servo may turn until the frame that ends the step is read."""
+"""Maximum angle by which the servo turns until the car reads the frame that ends the step."""
 
 
 def camera(pair: Pair) -> dict[str, float]:

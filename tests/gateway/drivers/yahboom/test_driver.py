@@ -1,4 +1,4 @@
-"""What a driver of this family refuses, and what it claims of the parts of a car."""
+"""The refusals of a driver of this family, and its claims about the parts of a car."""
 
 import pytest
 
