@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from hypothesis import HealthCheck, settings
 from xdist.remote import Producer
+from xdist.workermanage import WorkerController
 
 from tests.support import scheduling
 from tests.support.signals import give_default_signals
@@ -50,9 +51,24 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Let the scheduler find the session."""
+    session.config.stash[scheduling.SESSION] = session
+
+
+def pytest_configure_node(node: WorkerController) -> None:
+    """Tell a worker of pytest-xdist its kind."""
+    scheduling.choose_kind(node)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not collect a file whose tests are for other workers."""
+    return True if scheduling.ignores(collection_path, config) else None
+
+
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Lower the priority of a worker in the background."""
-    scheduling.lower_priority(session.config, (item.nodeid for item in session.items))
+    scheduling.lower_priority(session.config)
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups

@@ -4,13 +4,16 @@ Tests that compute have workers of their own, in the background, with a low prio
 foreground: they mostly wait for processes, cars and seconds. The background is done first, because it gets all the time
 that the foreground leaves. From then on, half of that time would be lost. So there are workers in reserve, which help
 the foreground when the background is done.
+
+A worker collects only the files whose tests it may run. When each of the thirteen collected all, both processors did
+nothing else for the first half minute.
 """
 
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Sequence
 from enum import Enum, auto
-from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -33,13 +36,18 @@ _FOREGROUND: Final = int(FOREGROUND_PER_PROCESSOR * _PROCESSORS)
 _RESERVE: Final = int(RESERVE_PER_PROCESSOR * _PROCESSORS)
 WORKERS: Final = _FOREGROUND + _RESERVE + _PROCESSORS
 """Number of workers. One for each processor is in the background."""
-_MIN_WAITING: Final = 1000
-"""Minimum number of tests that do not only compute, for workers of different kinds. With fewer, all workers are of the
-foreground: beside workers that compute, those in the background would get no time."""
+_WHOLE: Final = ("tests",)
+"""The arguments of a run of all tests, which has workers of different kinds. In a run of few tests, each worker takes
+all: beside workers of the foreground, those in the background would get no time."""
+SESSION: Final = pytest.StashKey[pytest.Session]()
+_KIND: Final = "kind"
+"""The name of a worker's kind in its input."""
 _LOWEST_PRIORITY: Final = 19
 _COMPUTING_TIMEOUT_S: Final = 600
 """Timeout of a test that computes. In the background it waits for all other processes: on a machine with other work, a
 test of 6 s took more than the 120 s of the other tests."""
+_FEW: Final = 2
+"""Number of tests with which a worker gets more, as in pytest-xdist: one runs, and it must know the next one."""
 _ASSIGNED_TOGETHER: Final = 8
 """Number of short tests of a file that one worker gets with one message. With a message for each test, the messages and
 the bookkeeping of pytest-xdist took as long as 4,000 of its shortest tests."""
@@ -86,10 +94,12 @@ _STARTING: Final = (
 
 
 class WorkerKind(Enum):
-    """Which tests a worker runs."""
+    """Which tests a worker collects and runs."""
 
+    ALL = auto()
+    """All tests, as in a run without workers."""
     FOREGROUND = auto()
-    """All tests, first those that do not only compute."""
+    """Tests that do not only compute."""
     RESERVE = auto()
     """Tests of the foreground, when the background is done."""
     BACKGROUND = auto()
@@ -120,25 +130,34 @@ def _group(item: pytest.Item) -> str:
     return str((*mark.args, *mark.kwargs.values())[0]) if mark is not None else ""
 
 
-def are_divided(workers: int, tests: Iterable[str]) -> bool:
-    """Return True if the workers are of different kinds in a run of tests with these ids."""
-    return workers == WORKERS and sum(not computes(each) for each in tests) >= _MIN_WAITING
+def choose_kind(node: WorkerController) -> None:
+    """Choose the kind of a worker, such as `gw7`, before it starts. One that replaces a crashed one takes all tests."""
+    index = int(node.gateway.id.removeprefix("gw"))
+    if node.workerinput["workercount"] != WORKERS or tuple(node.config.args) != _WHOLE or index >= WORKERS:
+        kind = WorkerKind.ALL
+    elif index < _FOREGROUND:
+        kind = WorkerKind.FOREGROUND
+    else:
+        kind = WorkerKind.RESERVE if index < _FOREGROUND + _RESERVE else WorkerKind.BACKGROUND
+    node.workerinput[_KIND] = kind.name
 
 
-def kind_of(worker: str) -> WorkerKind:
-    """Return the kind of a worker (such as `gw7`) if the workers are divided."""
-    index = int(worker.removeprefix("gw"))
-    if index < _FOREGROUND:
-        return WorkerKind.FOREGROUND
-    return WorkerKind.RESERVE if index < _FOREGROUND + _RESERVE else WorkerKind.BACKGROUND
+def kind_of(node: WorkerController | pytest.Config) -> WorkerKind:
+    """Return the kind of a worker: of another one, or of this process."""
+    return WorkerKind[getattr(node, "workerinput", {}).get(_KIND, WorkerKind.ALL.name)]
 
 
-def lower_priority(config: pytest.Config, tests: Iterable[str]) -> None:
+def ignores(file: Path, config: pytest.Config) -> bool:
+    """Return True if this worker runs no test of a file."""
+    kind = kind_of(config)
+    if kind == WorkerKind.ALL or not file.is_file():
+        return False
+    return computes(file.relative_to(config.rootpath).as_posix()) != (kind == WorkerKind.BACKGROUND)
+
+
+def lower_priority(config: pytest.Config) -> None:
     """Lower the priority of this process if it is a worker in the background."""
-    given = getattr(config, "workerinput", None)
-    if given is None or not hasattr(os, "nice"):
-        return
-    if kind_of(given["workerid"]) == WorkerKind.BACKGROUND and are_divided(given["workercount"], tests):
+    if kind_of(config) == WorkerKind.BACKGROUND and hasattr(os, "nice"):
         os.nice(_LOWEST_PRIORITY)
         if _AUTOGROUP.exists():
             os.setsid()
@@ -146,13 +165,38 @@ def lower_priority(config: pytest.Config, tests: Iterable[str]) -> None:
 
 
 class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has no types
-    """`--dist loadgroup` with workers in the background, and in reserve."""
+    """`--dist loadgroup` with workers that have different tests: in the foreground, in reserve, in the background."""
 
     def __init__(self, config: pytest.Config, log: Producer) -> None:
         super().__init__(config, log)
-        config.option.loadscopereorder = False  # `sort` has done it
+        self.collection: list[str] | None = None
         self._scopes: dict[str, str] = {}
         self._short: Counter[str] = Counter()
+
+    def add_node_collection(self, node: WorkerController, collection: Sequence[str]) -> None:
+        """Take the tests that a worker has collected."""
+        self.registered_collections[node] = list(collection)
+
+    def schedule(self) -> None:
+        """Give each worker its first tests when all have collected, or more tests later."""
+        if self.collection is None:
+            if not self._check_nodes_have_same_collection():
+                return
+            self.collection = tests = list(dict.fromkeys(chain.from_iterable(self.registered_collections.values())))
+            self.config.stash[SESSION].testscollected = len(tests)  # pytest shows a share of it
+            for nodeid in tests:
+                self.workqueue.setdefault(self._split_scope(nodeid), {})[nodeid] = False
+        for node in self.nodes:
+            self._reschedule(node)
+            self._reschedule(node)  # a worker begins a test when it knows the next one
+
+    def _check_nodes_have_same_collection(self) -> bool:
+        """Return True if the workers with the same tests to collect have collected the same tests."""
+        firsts: dict[bool, list[str]] = {}
+        for node, collection in self.registered_collections.items():
+            if firsts.setdefault(kind_of(node) == WorkerKind.BACKGROUND, collection) != collection:
+                return bool(super()._check_nodes_have_same_collection())  # it says what differs
+        return True
 
     def _split_scope(self, nodeid: str) -> str:
         """Return the work unit of a test."""
@@ -165,33 +209,33 @@ class Scheduling(LoadGroupScheduling):  # type: ignore[misc]  # pytest-xdist has
             self._scopes[nodeid] = scope
         return self._scopes[nodeid]
 
-    def _assign_work_unit(self, node: WorkerController) -> None:
-        # tests/conftest.py has sorted the tests that compute to the end.
-        last = next(reversed(self.workqueue))
-        background_has_tests = computes(next(iter(self.workqueue[last])))
-        kind = self._kind_of(node)
-        if kind == WorkerKind.RESERVE and background_has_tests:
+    def _reschedule(self, node: WorkerController) -> None:
+        """Give a worker one more work unit if it has few tests left. End it if there are none for it."""
+        kind = kind_of(node)
+        if node.shutting_down or node not in self.registered_collections:  # it comes for one that crashed
             return
-        if kind == WorkerKind.BACKGROUND:
-            if not background_has_tests:
-                # Processes that this worker started would have low priority, too. So it takes no other tests.
-                node.shutdown()
+        if kind == WorkerKind.RESERVE and self._has_work(WorkerKind.BACKGROUND):
+            return
+        if not self._has_work(kind):
+            node.shutdown()
+            if kind == WorkerKind.BACKGROUND:
                 self._call_reserve()
-                return
-            self.workqueue.move_to_end(last, last=False)
-        super()._assign_work_unit(node)
+        elif self._pending_of(self.assigned_work[node]) <= _FEW:
+            if kind == WorkerKind.BACKGROUND:
+                self.workqueue.move_to_end(next(reversed(self.workqueue)), last=False)
+            self._assign_work_unit(node)
+
+    def _has_work(self, kind: WorkerKind) -> bool:
+        """Return True if work units wait for a kind of worker. `sort` has put those that compute last."""
+        if not self.workqueue or kind == WorkerKind.ALL:
+            return bool(self.workqueue)
+        units = reversed(self.workqueue) if kind == WorkerKind.BACKGROUND else iter(self.workqueue)
+        first = next(iter(self.workqueue[next(units)]))
+        return computes(first) == (kind == WorkerKind.BACKGROUND)
 
     def _call_reserve(self) -> None:
         """Give the workers in reserve their first tests."""
         for node in self.nodes:
-            if self._kind_of(node) == WorkerKind.RESERVE:
+            if kind_of(node) == WorkerKind.RESERVE:
                 self._reschedule(node)
-                self._reschedule(node)  # a worker begins a test when it knows the next one
-
-    def _kind_of(self, node: WorkerController) -> WorkerKind:
-        """Return the kind of a worker."""
-        return kind_of(node.gateway.id) if self._are_divided else WorkerKind.FOREGROUND
-
-    @cached_property
-    def _are_divided(self) -> bool:
-        return are_divided(self.numnodes, self.collection or ())
+                self._reschedule(node)
