@@ -11,7 +11,7 @@ from schemas import topics
 HISTORY_TIMEOUT_S: Final = 10.0
 """Timeout for the history of many cars."""
 MAX_HISTORY_QUERIES: Final = 4
-"""Maximum number of queries for one history, with those for values that were lost on the way."""
+"""Maximum number of queries for one history. A query is repeated if values were lost on the way."""
 MAX_HISTORY_S: Final = 7 * 86_400.0
 """Maximum of `since_s`: a week."""
 
@@ -32,7 +32,7 @@ def selector(key_expression: str, *, last: int | None = None, since_s: float | N
 
 
 def merge(earlier: Iterable[Reading], more: Iterable[Reading], last: int | None = None) -> list[Reading]:
-    """Merge the readings of two answers, sorted by key and time, at most `last` of each key."""
+    """Merge the readings of two answers. Return at most the last `last` of each key, sorted by key, boot and number."""
     # If a link's queue is full, a gateway drops answers and does not block. So a client that finds gaps queries again.
     # Number the boots (runs of a gateway) in the order of arrival, because their ids are random.
     boots: dict[str, int] = {}
@@ -64,12 +64,13 @@ def gaps(readings: Iterable[Reading]) -> dict[str, int]:
 def describe_shortfalls(
     readings: Iterable[Reading], now: datetime, *, last: int | None = None, since_s: float | None = None
 ) -> list[str]:
-    """Describe why there are fewer readings than requested: at most two lines for each key, one for all states.
+    """Describe why there are fewer readings than requested.
 
+    At most two lines for each key with a history, and one line for all states together.
     readings: sorted as `merge` sorts.
     """
     every, has_states = list(readings), False
-    lines = [f"{key}: {count} missing in between, lost on the way. Try again." for key, count in gaps(every).items()]
+    lines = [f"{key}: {count} values are missing, lost on the way. Try again." for key, count in gaps(every).items()]
     for key, group in itertools.groupby(every, key=lambda reading: reading.key):
         found, topic = list(group), topics.of_key(key)
         if topic is None:
@@ -84,8 +85,8 @@ def describe_shortfalls(
             if full and oldest_s < since_s and (last is None or last > topic.history_size):
                 lines.append(f"{key}: only the last {oldest_s:.1f} s of {since_s:g} s, because {keeps}")
         elif last is not None and len(found) < last:
-            more = keeps if full else "its gateway has no more"
-            lines.append(f"{key}: {len(found)} of {last}, because {more}")
+            why = keeps if full else "its gateway has no more"
+            lines.append(f"{key}: {len(found)} of {last}, because {why}")
     if has_states and last != 1:
         lines.append("Gateways keep only the latest value of a state. A recording has all values (`fleet record`).")
     return lines

@@ -14,6 +14,7 @@ from schemas.suggestion import did_you_mean
 from schemas.words import Basis, Phase, Reason
 
 NO_ANSWER: Final = "no_answer"
+"""Phase and code of a command that got no answer."""
 NO_RESULT: Final = "no_result"
 """Code of a command whose last event is missing."""
 _STILL_STOPPED: Final = (Reason.ESTOPPED, Reason.HELD)
@@ -21,13 +22,13 @@ _STILL_STOPPED: Final = (Reason.ESTOPPED, Reason.HELD)
 _FAILED_PHASES: Final = frozenset({Phase.SUPERSEDED, Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})
 
 OUTCOME_MARGIN_S: Final = 5.0
-"""Time that is added to the longest time after which a command's last event is due."""
+"""Time that a command's last event may be late: it is added to the longest time that the command itself can take."""
 GATEWAY_RETURN_TIMEOUT_S: Final = 1.0
 """Timeout for a gateway to rejoin the bus. A gateway tries to do so twice a second."""
 GATEWAY_RESTART_TIMEOUT_S: Final = 15.0
 """Timeout for a car's new gateway if a supervisor starts one. The supervisor takes 4 s to notice a hang."""
 OVERLOAD_ANSWER_TIMEOUT_S: Final = 10.0
-"""Timeout for an answer on an overloaded machine. The token shows much earlier that a gateway has gone."""
+"""Timeout for an answer on an overloaded machine. A gateway that has gone is noticed earlier: its token disappears."""
 LATE_ANSWER_S: Final = 2.0
 """If an answer takes longer than this, further timeouts count from the answer, not from the request."""
 
@@ -73,9 +74,10 @@ class Outcome:
 
     @property
     def code(self) -> str:
-        """Why it was not carried out: the reason, else the phase in which it ended, `no_answer` or `no_result`.
+        """Why the command was not carried out. Empty if it was.
 
-        Empty if it was carried out.
+        The gateway's reason if there is one, else `no_answer`, else the phase in which the command failed, else
+        `no_result`.
         """
         if self.ok or self.reason:
             return self.reason
@@ -161,9 +163,9 @@ class Progress:
     def _joined(self) -> bool:
         """True if the command extends a running drive. Then no event of this command says when the drive ends.
 
-        A drive that begins is queued before it is sent, an extension is not.
+        A drive that begins is queued before it is sent. An extension is sent without being queued.
         """
-        # Decide by the events, because they come in order. The answer may arrive long before them.
+        # Wait for the event `sent`: the answer may arrive long before it, and the events come in order.
         return self._until is Until.OVER and self._sent_event and not self._queued
 
     @property
@@ -180,7 +182,7 @@ class Progress:
         wait_s = {
             Until.SENT: MAX_QUEUE_TIME_S,
             Until.STOPPED: self._worst_case_s + MAX_EVIDENCE_TIMEOUT_S,
-            # The duration counts from the frame, which may have to wait for a stop.
+            # The duration counts from the time of the frame. The frame may have to wait for the end of a stop.
             Until.OVER: self._duration_s + (0.0 if self._sent_event else MAX_QUEUE_TIME_S),
         }[self._until]
         return self._timeout_from + wait_s + OUTCOME_MARGIN_S
@@ -227,7 +229,10 @@ class Progress:
             self.on_presence(at, alive=False)
 
     def on_supervised(self, at: float, *, present: bool) -> None:
-        """Wait longer for a gateway that is gone: a supervisor starts a new one."""
+        """Note that a supervisor restarts the gateway, so that a gateway that is gone is awaited for longer.
+
+        present: False if the gateway is gone now.
+        """
         self._is_supervised = True
         if not present:
             self.on_presence(at, alive=False)
@@ -237,7 +242,7 @@ class Progress:
         self._foreign = words
 
     def on_query_failed(self, words: str, at: float) -> None:
-        """Handle the end of a query without an answer.
+        """Handle a query that ended without an answer.
 
         A stop, or a command to a gateway that a supervisor restarts, waits until its deadline. Any other command is
         given up.
@@ -257,7 +262,7 @@ class Progress:
             self._end(NO_ANSWER, "", words, at, ok=False)
 
     def on_query_timeout(self, at: float) -> None:
-        """Give up if the query has timed out without an answer."""
+        """Handle the timeout of the query. Give up, unless the gateway has answered or a supervisor restarts it."""
         late = f"no answer after {at - self._asked_at:.0f} s"
         if self._gone_at is None:
             words = f"It is unknown what {self.car} does: its gateway is overloaded or hangs ({late}). Look at the car."
@@ -275,7 +280,7 @@ class Progress:
             self._gone_at = at
 
     def give_up(self, at: float) -> None:
-        """End because the deadline has passed. The outcome is unknown, except for a drive that was extended."""
+        """End because the deadline has passed. The outcome is unknown, unless this command has extended a drive."""
         if self.awaits_bus:
             self._end(NO_ANSWER, "", bus_lost_words(self.car), at, ok=False)
             return
@@ -284,8 +289,8 @@ class Progress:
             return
         if self._gone_at is not None:
             words = (
-                f"{self.car} may be moving and nothing can stop it from here: its gateway is gone. Go to the car. "
-                "Restarting the gateway (`fleet up`) stops it."
+                f"{self.car} may be moving, and no command reaches it: its gateway is gone. Go to the car, or start "
+                "the gateway again (`fleet up`), which stops the car."
             )
             self._end(self._phase, "", words, at, ok=False)
             return
@@ -329,7 +334,7 @@ class Progress:
                 took_s=took_s,
             )
             worst_case_s = None if self._until is Until.OVER else self._worst_case_s or None
-            is_in_force = ok or reason == Reason.NOT_SHOWN  # an e-stop that no reading shows is in force, too
+            is_in_force = ok or reason == Reason.NOT_SHOWN  # an e-stop is in force even if no reading shows the stop
             after = NEXT_STEPS.get(self._verb, "").format(car=self.car) if is_in_force else ""
             # The effect of a command that was carried out contains the gateway's words, if there are any.
             told = (effect or words) if ok else (words or effect)

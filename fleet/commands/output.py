@@ -1,4 +1,4 @@
-"""Prints readings as lines or JSON objects, tables, CSV, and progress bars."""
+"""Writes readings as lines or as JSON objects, and prints tables, CSV and progress bars."""
 
 import csv
 import io
@@ -26,9 +26,9 @@ from schemas.process import stdio
 PROGRESS_BAR_DELAY_S: Final = 1.0
 _PROGRESS_STEP: Final = 1024
 ROWS_AT_ONCE: Final = 1024
-"""Number of rows in a block. A table is printed in blocks, because a million rows would fill the memory."""
+"""Number of rows in a block. `aligned` and `echo_csv` take blocks, because a million rows would fill the memory."""
 MAX_CELL: Final = 60
-"""Maximum characters of a cell with text from a recording. Anybody may have written that text, of any length."""
+"""Maximum characters of a cell with text from a recording. Anybody may have written that text, and it may be long."""
 _HEADER_FIELDS: Final = frozenset({"stamp", "timestamp", "car", "seq", "boot_id"})
 
 T = TypeVar("T")
@@ -102,12 +102,12 @@ def _width(text: str) -> int:
 
 
 def echo_safely(text: str, *, err: bool = False) -> None:
-    """Print text that strangers may have written in part. Control characters are printed as escapes."""
+    """Print text of which strangers may have written a part. Control characters are printed as escapes."""
     click.echo(printable_lines(text), err=err)
 
 
 def echo_csv(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a CSV table (RFC 4180), a block of rows at a time. None is an empty cell.
+    """Print a CSV table (RFC 4180), a block of rows at a time. A value of None becomes an empty cell.
 
     On a terminal, control characters are printed as escapes. Files and pipes get the cells unchanged.
     """
@@ -134,7 +134,7 @@ def _shortened(text: str, width: int) -> str:
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Show a progress bar on a terminal after a second, if the total is known.
 
-    Yield the function to call with the number of newly done items.
+    Yield a function. Call it with the number of items done since the last call.
     """
     bar: Any = None
     began = time.monotonic()

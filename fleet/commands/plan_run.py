@@ -51,7 +51,7 @@ a plan:
     "run_name",
     default="",
     metavar="NAME",
-    help="Name of the run of `fleet up`. A restarted coordinator continues the phase and the rules of the same run.",
+    help="Name of the run of `fleet up`. A coordinator that starts again under this name goes on in the same phase.",
 )
 @starter_option()
 @json_option
@@ -66,10 +66,10 @@ def run(
     starter: int | None,
     as_json: bool,
 ) -> None:
-    """Run a plan until Ctrl-C, and print one line per decision. The plan leaves alone what you have stopped.
+    """Run a plan until Ctrl-C, and print one line per decision. The plan does not move a car that you have stopped.
 
-    Ctrl-C brings the cars of the plan to rest, and waits for that, at most until the next Ctrl-C. The exit code is 1 if
-    one of them may still be moving.
+    After Ctrl-C, the command stops the cars of the plan and waits until they stand. A second Ctrl-C ends the wait. The
+    exit code is 1 if one of them may still be moving.
     """
     parent = watched_pid(starter)
     plan = parse(read_text(path), str(path))
@@ -79,10 +79,10 @@ def run(
     found.raise_errors(str(path))
     for each in found.warnings:
         click.echo(each.at(str(path)), err=True)
-    stop, hurry = threading.Event(), threading.Event()
+    stop, stop_waiting = threading.Event(), threading.Event()
 
     def end() -> None:
-        (hurry if stop.is_set() else stop).set()
+        (stop_waiting if stop.is_set() else stop).set()
 
     signals.calls(end)
 
@@ -98,7 +98,7 @@ def run(
         identity=service(Service.COORDINATOR),
     ) as client:
         try:
-            moving = Coordinator(
+            may_move = Coordinator(
                 client,
                 plan,
                 on_decided,
@@ -106,10 +106,10 @@ def run(
                 listed,
                 None if file is None else people_table(file.people),
                 run_name,
-            ).run(lambda: stop.is_set() or has_ended(parent), hurry.is_set)
+            ).run(lambda: stop.is_set() or has_ended(parent), stop_waiting.is_set)
         except AnotherCoordinator as error:
             raise click.ClickException(str(error)) from None
-    raise SystemExit(1 if moving else 0)
+    raise SystemExit(1 if may_move else 0)
 
 
 def decision_line(decision: Decision) -> str:

@@ -506,7 +506,7 @@ class Console:
     def _on_message(self, page: PageLink, message: PageMessage) -> None:
         now = time.monotonic()
         self._end_presses_of_sleep()
-        if message.is_command:
+        if message.needs_budget:
             if message.kind != "give_back" and self._is_late(message):
                 raise BadPageMessage(TOO_LATE)
             cars = () if message.kind == Verb.UNPAUSE else message.cars()

@@ -42,13 +42,13 @@ class PageMessage(Struct, frozen=True):
         return cls(fields)
 
     @property
-    def is_command(self) -> bool:
-        """True if the message is a command to gateways that counts against a budget.
+    def needs_budget(self) -> bool:
+        """True for a command to gateways that takes from the page's budget of commands when it arrives.
 
-        Stops do not count. A press counts, too, but its own handler counts it.
+        A stop takes nothing. Whether a held drive key takes something, its own handler decides.
         """
-        is_done = self.kind == "do" and self.fields.get("verb") not in STOPS
-        return is_done or self.kind in ("take", "give_back", Verb.UNPAUSE)
+        acts = self.kind == "do" and self.fields.get("verb") not in STOPS
+        return acts or self.kind in ("take", "give_back", Verb.UNPAUSE)
 
     @property
     def kind(self) -> str:
@@ -56,7 +56,7 @@ class PageMessage(Struct, frozen=True):
         return self.text("t", 16)
 
     def text(self, name: str, longest: int = 64) -> str:
-        """Return a text. Raises BadPageMessage."""
+        """Return the text of a field, empty without one. Raises BadPageMessage."""
         value = self.fields.get(name, "")
         if not isinstance(value, str) or len(value) > longest:
             raise BadPageMessage(f"{name} is not a text of at most {longest} characters")
@@ -67,7 +67,7 @@ class PageMessage(Struct, frozen=True):
         return value
 
     def text_if_valid(self, name: str, longest: int = 64) -> str:
-        """Return a text, or an empty one if it is not valid: a wrong detail must not make a stop fail."""
+        """Return the text of a field, empty if it is not valid: a wrong detail must not make a stop fail."""
         try:
             return self.text(name, longest)
         except BadPageMessage:
@@ -75,29 +75,29 @@ class PageMessage(Struct, frozen=True):
 
     @property
     def reason(self) -> str:
-        """The reason of a stop, which its request makes valid."""
+        """The reason of a stop, of any length. `estop_request` cuts and cleans it."""
         value = self.fields.get("why", "")
         return value if isinstance(value, str) else ""
 
     def number(self, name: str) -> int:
-        """Return a whole number from 0. Raises BadPageMessage."""
+        """Return a whole number, 0 or more. Raises BadPageMessage."""
         value = self.fields.get(name)
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < _MAX_NUMBER:
-            raise BadPageMessage(f"{name} is not a whole number")
+            raise BadPageMessage(f"{name} is not a whole number from 0 to {_MAX_NUMBER - 1}")
         return value
 
     def cars(self) -> tuple[str, ...]:
         """Return names of cars, at least one. Raises BadPageMessage."""
         value = self.fields.get("cars")
         if not isinstance(value, list) or not 0 < len(value) <= MAX_CARS or not all(isinstance(e, str) for e in value):
-            raise BadPageMessage("cars is not a list of names")
+            raise BadPageMessage(f"cars is not a list of 1 to {MAX_CARS} names")
         try:
             return tuple(dict.fromkeys(keys.check_name(name) for name in value))
         except keys.BadKey as error:
             raise BadPageMessage(str(error)) from None
 
     def stopped_cars(self) -> tuple[str, ...]:
-        """Return the cars of a stop. Wrong names are left out, and do not keep the others from being stopped.
+        """Return the cars of a stop, at most `MAX_CARS`. Wrong names are left out: the others are stopped all the same.
 
         Raises BadPageMessage if no name is left.
         """
@@ -111,7 +111,7 @@ class PageMessage(Struct, frozen=True):
         return self.one_of("motion", MOTIONS)
 
     def one_of(self, name: str, allowed: frozenset[str]) -> str:
-        """Return one of these texts. Raises BadPageMessage."""
+        """Return the text of a field. Raises BadPageMessage if it is not one of the `allowed`."""
         value = self.text(name)
         if value not in allowed:
             raise BadPageMessage(f"{name} {value!r} is not allowed")
@@ -169,7 +169,7 @@ def _lend(message: PageMessage) -> commands.CommandRequest:
 def _resume(message: PageMessage) -> commands.CommandRequest:
     ids = message.fields.get("ids", [])
     if not isinstance(ids, list) or len(ids) > MAX_CARS or not all(isinstance(each, str) for each in ids):
-        raise BadPageMessage("ids is not a list of ids")
+        raise BadPageMessage(f"ids is not a list of at most {MAX_CARS} ids")
     return commands.resume_request([each[:64] for each in ids])
 
 

@@ -19,8 +19,8 @@ DEFAULT_EXPORTER_PORT: Final = 9478
 _WAIT_S: Final = 0.25
 """Maximum time until the exporter notices that it has to end."""
 _TOPICS: Final = ("state/*", "sensor/battery")
-"""Topics that the exporter subscribes to, and queries when a car appears. It leaves out the other readings, which come
-27 times a second in mode tracking."""
+"""The exporter subscribes to these topics, and queries them when a car appears. Of the readings, it takes only those of
+the battery: in the mode `tracking`, a car sends others 27 times a second."""
 
 _Family = CounterMetricFamily | GaugeMetricFamily
 
@@ -28,7 +28,7 @@ _Family = CounterMetricFamily | GaugeMetricFamily
 class Exporter(Collector):
     """A collector for the registry of Prometheus' client. `run` reads the bus.
 
-    A thread of the server calls `collect`.
+    A thread of the HTTP server calls `collect`.
     """
 
     def __init__(self, client: Fleet) -> None:
@@ -79,5 +79,5 @@ class Exporter(Collector):
 
 
 def _family(metric: Metric) -> _Family:
-    made = CounterMetricFamily if metric.kind is MetricKind.COUNTER else GaugeMetricFamily
-    return made(metric.name, metric.about, labels=metric.label_names)
+    family = CounterMetricFamily if metric.kind is MetricKind.COUNTER else GaugeMetricFamily
+    return family(metric.name, metric.about, labels=metric.label_names)

@@ -156,7 +156,7 @@ class LimitsEntry(Entry):
     )
     on_battery_low: BatteryAction = Field(
         default=BatteryAction.WARN,
-        description="reaction to a low battery, while the car reports its voltage, mostly only in mode manual. "
+        description="reaction to a low battery. Most cars report their voltage only in mode manual. "
         "warn: log it; refuse: also refuse new drives and modes; stop: also stop the car",
     )
     on_battery_critical: BatteryAction = Field(
@@ -170,7 +170,8 @@ class CommonEntry(Entry):
     # These defaults are only shown by editors, or are empty. fleet_file.py merges the layers of the file itself.
     platform: _Platform = Field(
         default=AUTO,
-        description="the program that runs on the car, with options, such as arduino+arm; auto: the gateway detects it",
+        description="the kind of program that runs on the car, with options, such as arduino+arm; auto: the gateway "
+        "detects it",
     )
     color: _Color = Field(
         default_factory=str,
@@ -185,8 +186,8 @@ class CommonEntry(Entry):
     limits: LimitsEntry = Field(default_factory=LimitsEntry, description="limits of speed, time and battery")
     roles: list[_Name] = Field(
         default_factory=list,
-        description="the only roles of the plan that the car may have; left out: any. A rule may give it a mode "
-        "all the same",
+        description="the only roles of the plan that the car may have; left out: any. Even so, a rule of the plan may "
+        "give the car a mode",
     )
 
 
@@ -227,23 +228,24 @@ class RecordEntry(Entry):
 
 
 class PinEntry(Entry):
-    """A condition. The quota removes the times around it last, while all pinned times fit into half of it."""
+    """A condition. What was recorded around the times at which it is true is kept longest."""
 
     when: str = Field(
-        description="the condition, true for at least one car, as in plans: `mode.verdict == 'contradicted'`"
+        description="the condition, written as in plans: `mode.verdict == 'contradicted'`. It is met if it is true for "
+        "at least one car"
     )
     before: _PinTime = Field(
-        default="30s", description="how long before the condition became true the pin begins: 1s to 1h"
+        default="30s", description="how long before the condition became true the kept time begins: 1s to 1h"
     )
     after: _PinTime = Field(
-        default="30s", description="how long after the condition was last true the pin ends: 1s to 1h"
+        default="30s", description="how long after the condition was last true the kept time ends: 1s to 1h"
     )
 
 
 class ConsoleEntry(Entry):
     """The web page of `fleet up`."""
 
-    port: int = Field(default=0, ge=0, le=65535, description="port at which the page is served; 0: 7480")
+    port: int = Field(default=0, ge=0, le=65535, description="port at which the page is served; 0: the usual one, 7480")
 
 
 class FileEntry(Entry):
@@ -265,8 +267,9 @@ class FileEntry(Entry):
     pin: list[PinEntry] = Field(
         default_factory=list,
         max_length=MAX_PIN_RULES,
-        description="conditions, such as `[{when: range_m < 0.1}]`: the quota removes the time around them last, as it "
-        "does for stops and marks, while all these times fit into half of it",
+        description="conditions, such as `[{when: range_m < 0.1}]`. Beyond the quota, what was recorded around the "
+        "times at which one is true, and around stops and marks, is removed last; but at most half of the quota is "
+        "kept for all that",
     )
     console: bool | ConsoleEntry = Field(
         default=False, description="true: `fleet up` serves the web page; or `{port: 8080}`, which also sets its port"

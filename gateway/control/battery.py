@@ -30,11 +30,11 @@ second."""
 class BatteryPolicy(Struct, frozen=True):
     """The threshold of each level (V at rest, that is without a load, for two cells), and the reaction to each level.
 
-    By default no level stops the car. If the voltage gets too low, the car resets, which stops it too.
+    By default, the gateway stops the car at no level. If the voltage gets too low, the car resets, and stops by that.
     """
 
-    low: BatteryAction = BatteryAction.WARN
-    critical: BatteryAction = BatteryAction.REFUSE
+    on_low: BatteryAction = BatteryAction.WARN
+    on_critical: BatteryAction = BatteryAction.REFUSE
     low_v: float = LOW_V
     critical_v: float = CRITICAL_V
 
@@ -52,9 +52,9 @@ class BatteryPolicy(Struct, frozen=True):
         """Return the reaction to a level, or None if it is ok or unknown."""
         match level:
             case BatteryLevel.LOW:
-                return self.low
+                return self.on_low
             case BatteryLevel.CRITICAL:
-                return self.critical
+                return self.on_critical
             case _:
                 return None
 
@@ -71,25 +71,27 @@ class Battery(Struct):
     measured_at: float = float("-inf")
     _loaded_at: float = float("-inf")
     _other: BatteryLevel | None = None
-    _since: float = 0.0
-    """`_other` is the level that the readings show instead of `level`. Since `_since`, all readings have been on the
-    same side of `level`: all worse, or all better."""
+    """The level to which `level` will change: of those that the readings show since `_other_since`, the nearest one.
+    None if the last reading showed `level` itself."""
+    _other_since: float = 0.0
+    """Since this time, all readings have shown worse levels than `level`, or all have shown better ones."""
     _rested_since: float | None = None
-    """The time of the first reading without a load after the start, or after the last one with a load."""
+    """The time since which no reading may have been lowered by a load. None if the last one may have been."""
     _is_settled: bool = False
-    """True once readings without a load have lasted `LEVEL_DEBOUNCE_S`, so that `level` follows from readings."""
+    """True once readings without a load have been coming for `LEVEL_DEBOUNCE_S`. Before that, an OK in `level` may be
+    only what is assumed at the start."""
 
     def on_voltage(self, voltage_v: float, *, loaded: bool, now: float) -> bool:
-        """Update the level with a measured voltage. Return True if it has changed; the first voltage changes none.
+        """Update the level with a measured voltage. Return True if it has changed.
 
-        With `loaded`, motors may be on.
+        The first voltage sets the level to OK, which is not a change. With `loaded`, motors may be on.
         """
         self.voltage_v = voltage_v
         self.measured_at = now
         if loaded:
             self._loaded_at = now
         changed = self._update_level(voltage_v, now)
-        if self.loaded:
+        if self.may_sag:
             self._rested_since = None
         elif self._rested_since is None:
             self._rested_since = now
@@ -104,7 +106,7 @@ class Battery(Struct):
         return battery
 
     def _update_level(self, voltage_v: float, now: float) -> bool:
-        low_v, high_v = rest_v(voltage_v, loaded=self.loaded)
+        low_v, high_v = rest_v(voltage_v, loaded=self.may_sag)
         worse, better = self.policy.level(high_v), self.policy.level(low_v - HYSTERESIS_V)
         if self.level is None:
             # Conclude nothing from the first reading: motors may have run until now, or the reading may be corrupted.
@@ -119,32 +121,32 @@ class Battery(Struct):
         elif self._other is None or (_LEVEL_RANK[self._other] > _LEVEL_RANK[self.level]) is not (
             _LEVEL_RANK[shown] > _LEVEL_RANK[self.level]
         ):
-            self._other, self._since = shown, now
+            self._other, self._other_since = shown, now
         else:
             # The readings may have shown different levels on this side of the current one, such as low and critical.
-            # Take the level that is nearer to the current one, because all of these readings show at least that level.
+            # Take the level nearest to the current one: every one of these readings is at least as far away.
             self._other = min(
                 self._other, shown, key=lambda each: abs(_LEVEL_RANK[each] - _LEVEL_RANK[self.level or each])
             )
-            if now - self._since >= LEVEL_DEBOUNCE_S:
+            if now - self._other_since >= LEVEL_DEBOUNCE_S:
                 self.level, self._other = self._other, None
                 return True
         return False
 
     @property
-    def loaded(self) -> bool:
-        """Return True if the last voltage may be below the voltage at rest."""
+    def may_sag(self) -> bool:
+        """Return True if the last voltage may be below the voltage at rest, because of a load."""
         return self.measured_at - self._loaded_at < LOAD_RECOVERY_S
 
     @property
     def charge(self) -> tuple[float, float] | None:
         """Return the charge and its error, or None if it is not known.
 
-        It is not known without a voltage, or if the battery must have more cells than the car is known to have.
+        It is not known without a voltage, or if the voltage is too high for a battery of `cells` cells.
         """
         if self.voltage_v is None or self.voltage_v > TWO_CELLS_V * self.cells / 2:
             return None
-        return charge(self.voltage_v, loaded=self.loaded, cells=self.cells)
+        return charge(self.voltage_v, loaded=self.may_sag, cells=self.cells)
 
     @property
     def action(self) -> BatteryAction | None:
@@ -164,8 +166,8 @@ class Battery(Struct):
         """Return why new drives and modes are refused, or an empty text if they are allowed."""
         action, words = self.action, self.words
         if not self._is_settled and self.voltage_v is not None:
-            # A plan gives a car its mode as soon as it can, and in most modes a car reports no voltage. So do not wait
-            # until the level follows from readings.
+            # A plan sets the mode of a car as soon as it can. In most modes, the car then reports no voltage any more,
+            # so the level might never settle. Until it has, one bad reading is enough to refuse.
             shown = self.policy.level(self.voltage_v)
             if self.level is not None and _LEVEL_RANK[shown] > _LEVEL_RANK[self.level]:
                 action = self.policy.action(shown)
@@ -185,8 +187,8 @@ def rest_v(voltage_v: float, *, loaded: bool) -> tuple[float, float]:
 def charge(voltage_v: float, *, loaded: bool, cells: int = 2) -> tuple[float, float]:
     """Return the charge and its error (half width), 0..1 each.
 
-    The charge is linear between empty and full. Under a load, only a range of the voltage at rest is known. The charge
-    is that of the middle of the range.
+    The charge is taken to rise linearly with the voltage at rest, from `EMPTY_V` to `FULL_V`. Under a load, only a
+    range of the voltage at rest is known. The charge is that of the middle of the range.
     """
     low_v, high_v = (each * 2 / cells for each in rest_v(voltage_v, loaded=loaded))
     share = ((low_v + high_v) / 2 - EMPTY_V) / (FULL_V - EMPTY_V)

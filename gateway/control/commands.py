@@ -1,4 +1,4 @@
-"""The commands that control handles, after parsing and range checks, and their answers. Values only."""
+"""The commands that control handles, after parsing and range checks, and their answers: plain values."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Final
@@ -13,25 +13,26 @@ from schemas.words import Light, Mode, Motion, Phase, Reason, ServoAction, Speed
 class Drive(Struct, frozen=True):
     """Hold a motion for `duration_s` seconds. `Motion.STOP` ends the motion that is held.
 
-    The time begins when the frame of the motion is written, and in a stream, when a sample arrives.
+    The time begins when the frame of the motion is written. Each further sample of a stream lets it begin again.
     """
 
     motion: Motion
     duration_s: float = 0.5
     continues: bool = False
-    """True: only prolong this motion while the same sender holds it. False: begin it if it is not held."""
+    """True: prolong this motion if the same sender holds it, but do not begin it. False: begin it if it is not held."""
 
 
 class SetMode(Struct, frozen=True):
-    """Bring the car into a mode. `Mode.MANUAL` closes the open mode."""
+    """Bring the car into a mode. `Mode.MANUAL` ends the mode in which the car drives by itself."""
 
     mode: Mode
 
 
 class PartAction(Struct, frozen=True):
-    """An action on a part of a car: light, servo, arm, speed, fan. It waits in the queue, and needs mode 0.
+    """An action other than driving: light, servo, arm, speed, fan. It waits in the queue, and needs mode manual.
 
-    `needs_lease` is True if it moves a part of the car, or changes how the car moves. Then its sender needs the lease.
+    `needs_lease` is True if the action moves a part of the car, or changes how the car moves. Then the sender needs the
+    lease.
     """
 
     needs_lease: ClassVar[bool] = True
@@ -62,13 +63,13 @@ class Signal(PartAction, frozen=True):
 
 
 class MoveServo(PartAction, frozen=True):
-    """Turn a servo by one step or to an end, as its car does, or to its middle."""
+    """Turn a servo one way, which is by one step or to the end, depending on the car. Or turn it to the middle."""
 
     action: ServoAction
 
 
 class AimServo(PartAction, frozen=True):
-    """Turn the front servo to an angle, 0..180 degrees, in the direction in which the car counts them."""
+    """Turn the front servo to an angle, 0..180 degrees. The car determines at which end 0 is."""
 
     deg: int
 
@@ -86,7 +87,7 @@ class ChangeSpeed(PartAction, frozen=True):
 
 
 class Fan(PartAction, frozen=True):
-    """Toggle the fan, or switch it on or off. To switch it, its current state must be known."""
+    """Toggle the fan, or set it to on or off. Only a fan whose present state is known can be set."""
 
     on: bool | None = None
 
@@ -113,13 +114,13 @@ class Resume(Struct, frozen=True):
 
 
 class Pause(Struct, frozen=True):
-    """Stop the car, and let only leads move the cars of the fleet until an `Unpause`."""
+    """Stop the car. Until an `Unpause`, only people of the rank lead may move cars of the fleet."""
 
     why: str = ""
 
 
 class Unpause(Struct, frozen=True):
-    """End the pause of the fleet. Move nothing."""
+    """End the pause of the fleet. By itself this moves no car."""
 
 
 class Lend(Struct, frozen=True):
@@ -134,7 +135,7 @@ class EndLoan(Struct, frozen=True):
 
 
 class TakeLease(Struct, frozen=True):
-    """Reserve the car for the sender for a short time, or end its lease."""
+    """Reserve the car for the sender for a short time. With `release`, end the sender's lease instead."""
 
     release: bool = False
 
@@ -153,7 +154,7 @@ PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {
     Verb.LEASE: TakeLease,
     Verb.FIND: Find,
 }
-"""Actions, by verb, whose fields are flags of the message. They need no parsing rules."""
+"""Actions, by verb, that need no rules of parsing: their fields, if they have any, are flags of the message."""
 
 
 class Command(Struct, frozen=True):
@@ -177,7 +178,10 @@ class Command(Struct, frozen=True):
 
 
 class Answer(Struct, frozen=True):
-    """The immediate answer to the sender. `status` is sent, queued or rejected."""
+    """The immediate answer to the sender. `status` is sent, queued or rejected.
+
+    `worst_case_s`: for a stop, the maximum time until the motors are off; 0 for other commands.
+    """
 
     status: Phase
     reason: Reason | None = None

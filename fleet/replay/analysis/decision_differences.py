@@ -8,7 +8,7 @@ from fleet.replay.analysis.recorded_decisions import RecordedDecision, Timeline
 
 
 class DecisionDifference(Struct, frozen=True):
-    """Time span in which the recorded decision differs from the new one. None means no decision."""
+    """Time span in which the recorded decision, `then`, differs from the new one, `now`. None means no decision."""
 
     subject: str
     from_ns: int
@@ -26,13 +26,13 @@ def differences(then: Timeline, now: Timeline, start_ns: int, end_ns: int) -> It
         pair: tuple[RecordedDecision | None, RecordedDecision | None] = (None, None)
         for at_ns in (*times, end_ns):
             current = _at(old, at_ns), _at(new, at_ns)
-            same = at_ns == end_ns or _what(current[0]) == _what(current[1])
+            ends = at_ns == end_ns or _what(current[0]) == _what(current[1])
             if open_from is not None and (
-                same or (_what(current[0]), _what(current[1])) != (_what(pair[0]), _what(pair[1]))
+                ends or (_what(current[0]), _what(current[1])) != (_what(pair[0]), _what(pair[1]))
             ):
                 yield DecisionDifference(subject, open_from, at_ns, *pair)
                 open_from = None
-            if not same and open_from is None:
+            if not ends and open_from is None:
                 open_from, pair = at_ns, current
 
 

@@ -26,7 +26,7 @@ _DECODER: Final = json.JSONDecoder()
 
 
 class Feedback(Struct, frozen=True):
-    """One report. A field is None if the report does not have it, or if its value cannot be used.
+    """One report. An optional field is None if the report does not have it, or if its value cannot be used.
 
     `at` is the time of the last byte.
     """
@@ -47,7 +47,7 @@ class Feedback(Struct, frozen=True):
 
 
 def read_line(line: bytes, at: float) -> list[Event]:
-    """Return the events in one line, without its end."""
+    """Return the events in one line, which is given without the characters that end it."""
     text = line.decode("latin-1")
     events: list[Event] = []
     place = 0
@@ -61,7 +61,7 @@ def read_line(line: bytes, at: float) -> list[Event]:
         try:
             found, place = _DECODER.raw_decode(text, start)
         except (ValueError, RecursionError):
-            # A truncated object and a whole one can share a line, so look on after the truncated one.
+            # A truncated object and a whole one can share a line, so the next `{` may begin a whole one.
             following = text.find("{", start + 1)
             place = following if following >= 0 else len(text)
             events.append(Rejected(text[start:place].encode("latin-1"), at, Cause.TRUNCATED))
@@ -82,7 +82,7 @@ def _event(found: Any, raw: bytes, at: float) -> Event:
     has_arm = not _OF_ARM.isdisjoint(found)
     has_attitude = firmware is UgvFirmware.GENERAL and not has_arm
     attitude = _tuple(found, ("r", "p", "y"), math.radians(1.0)) if has_attitude else None
-    if attitude is not None:  # more than a turn is no measurement: without a checksum, a lost point makes such a number
+    if attitude is not None:  # there is no checksum, and a lost decimal point makes an angle of more than a full turn
         is_angle = max(map(abs, attitude)) <= math.tau
         attitude = tuple(math.remainder(each, math.tau) for each in attitude) if is_angle else None
     odometer = _tuple(found, ("odl", "odr"), 0.01) if firmware is UgvFirmware.ROS else None
@@ -96,9 +96,9 @@ def _voltage(found: dict[str, Any], firmware: UgvFirmware | None) -> float | Non
     return volts if firmware is not None and 0.0 < volts <= MAX_V else None
 
 
-def _tuple(found: dict[str, Any], names: tuple[str, ...], unit: float) -> Any:
+def _tuple(found: dict[str, Any], names: tuple[str, ...], scale: float) -> Any:
     values = [_number(found, name) for name in names]
-    return None if any(each is None for each in values) else tuple(unit * (each or 0.0) for each in values)
+    return None if any(each is None for each in values) else tuple(scale * (each or 0.0) for each in values)
 
 
 def _number(found: dict[str, Any], name: str) -> float | None:

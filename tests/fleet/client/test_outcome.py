@@ -146,7 +146,7 @@ def test_lost_gateway_is_reported_after_grace_second() -> None:
     progress.give_up(104.0)
     assert progress.outcome is not None
     assert (progress.outcome.ok, progress.outcome.phase) == (False, "sent")
-    assert progress.outcome.words.startswith("red may be moving ")
+    assert progress.outcome.words.startswith("red may be moving")
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,7 @@ def test_fleet_file_defaults() -> None:
 
 def test_battery_defaults_match_gateway_defaults() -> None:
     policy = battery.BatteryPolicy()
-    assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.low, policy.critical)
+    assert (Limits().on_battery_low, Limits().on_battery_critical) == (policy.on_low, policy.on_critical)
 
 
 def test_all_faults_of_a_fleet_are_told_at_once() -> None:

@@ -181,11 +181,11 @@ def test_readings_on_both_sides_of_critical_are_low_at_least() -> None:
 
 
 def test_policy_may_stop_or_only_warn() -> None:
-    assert BatteryPolicy(critical=BatteryAction.STOP).action(BatteryLevel.CRITICAL) is BatteryAction.STOP
-    warns = Battery(BatteryPolicy(critical=BatteryAction.WARN))
+    assert BatteryPolicy(on_critical=BatteryAction.STOP).action(BatteryLevel.CRITICAL) is BatteryAction.STOP
+    warns = Battery(BatteryPolicy(on_critical=BatteryAction.WARN))
     hear(warns, *[6.0] * 6)
     assert (warns.action, warns.refusal) == (BatteryAction.WARN, "")
-    refuses = Battery(BatteryPolicy(low=BatteryAction.REFUSE))
+    refuses = Battery(BatteryPolicy(on_low=BatteryAction.REFUSE))
     hear(refuses, *[6.9] * 6)
     assert refuses.refusal.startswith("battery low: 6.90 V, charge 25% +- 15%. Charge it")
 

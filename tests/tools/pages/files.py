@@ -73,9 +73,10 @@ def _bounds(each: dict[str, Any]) -> str:
     high = each.get("maximum", each.get("exclusiveMaximum"))
     if low is None and high is None:
         return ""
-    above = "more than " if "exclusiveMinimum" in each else ""
+    if low is not None and high is not None and "exclusiveMinimum" in each:
+        return f", more than {low:g}, at most {high:g}"
     return (
-        f", {above}{low:g} to {high:g}"
+        f", {low:g} to {high:g}"
         if low is not None and high is not None
         else f", from {low if low is not None else high:g}"
     )

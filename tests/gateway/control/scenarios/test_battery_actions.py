@@ -98,7 +98,7 @@ def test_three_cells_count_also_if_they_were_detected(platform: str) -> None:
 
 def test_car_can_be_stopped_by_its_battery() -> None:
     desk = Workbench()
-    desk.control = control(parse_platform("arduino"), battery_policy=BatteryPolicy(critical=BatteryAction.STOP))
+    desk.control = control(parse_platform("arduino"), battery_policy=BatteryPolicy(on_critical=BatteryAction.STOP))
     desk.ready()
     desk.ask(FORWARD, identity="d")
     desk.car.reading = reading(5.9)
