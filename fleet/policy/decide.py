@@ -146,7 +146,9 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
         reserved=reserved,
         roles_before=roles_before,
         unresponsive=frozenset(
-            car for car, attempts in memory.mode_attempts.items() if attempts.count >= ATTEMPTS_BEFORE_REPLACEMENT
+            car
+            for car, attempts in memory.mode_attempts.items()
+            if attempts.failed(now, busy=snapshot.cars.get(car, UNKNOWN_CAR).busy) >= ATTEMPTS_BEFORE_REPLACEMENT
         ),
         pinned=pinned_roles(plan, rules, subjects),
         in_force=frozenset(plan.roles) if roles_in_force is None else roles_in_force,

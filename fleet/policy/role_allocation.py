@@ -72,7 +72,8 @@ class Candidates(Struct, frozen=True):
     roles_before: Mapping[str, str]
     """The role of each car before this step."""
     unresponsive: frozenset[str]
-    """Cars that were commanded into their mode more than once, and have not stayed in it for long yet."""
+    """Cars that were commanded into their mode more than once and, if they are not in it now, have failed to change to
+    it. A car is no longer among them once it has stayed in its mode for a while."""
     pinned: Mapping[str, PinnedRole]
     """The roles that rules pin, by car."""
     in_force: frozenset[str]

@@ -40,6 +40,13 @@ class ModeAttempts(Struct, frozen=True):
         """Return the attempts after one more command."""
         return ModeAttempts(self.mode, self.count + 1, now + backoff_s(self.count + 1, 1.0, MODE_RETRY_MAX_S))
 
+    def failed(self, now: float, *, busy: bool) -> int:
+        """Return the number of commands that have failed if the car is not in the mode now.
+
+        The last one may still succeed while it has no outcome (`busy`), or was sent only a moment ago.
+        """
+        return self.count - (busy or now < self.again_at)
+
 
 class HeldRole(Struct, frozen=True):
     """A role that a car has, and how it got that role."""

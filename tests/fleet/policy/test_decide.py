@@ -176,6 +176,34 @@ def test_contradicted_mode_is_retried_slower_then_reassigned() -> None:
     assert run.roles == {"red": "scout"}
 
 
+def test_car_that_lost_its_mode_once_keeps_its_role_while_it_changes_back() -> None:
+    """A car that had reset after 11 s in its mode was replaced in the moment in which it was asked the second time."""
+    run = PolicyRun(ONE, "green", "red")
+    run.until(11.0)
+    assert run.asked == [(0.1, "green", "tracking")]
+    run.obey = False
+    run.change("green", verdict="contradicted", evidence="silent for 1.2 s")
+    run.at(11.1)
+    run.change("green", busy=True)
+    run.until(12.0)
+    run.change("green", mode="manual", verdict="assumed")  # its gateway stops it first
+    run.until(16.0)
+    run.change("green", mode="tracking", busy=False)
+    run.until(60.0)
+    assert run.asked == [(0.1, "green", "tracking"), (11.1, "green", "tracking")]
+    assert run.roles == {"green": "scout"}
+
+
+def test_car_that_does_not_change_back_is_replaced() -> None:
+    run = PolicyRun(ONE, "green", "red")
+    run.until(11.0)
+    run.change("green", verdict="contradicted", evidence="silent for 1.2 s")
+    run.obey = False
+    run.until(14.0)
+    assert [car for _, car, mode in run.asked if mode == "tracking"] == ["green", "green", "red"]
+    assert run.roles == {"red": "scout"}
+
+
 def test_role_goes_to_another_car_after_refusal() -> None:
     run = PolicyRun(ONE, "green", "red", obey=False)
     run.at(0.0)
