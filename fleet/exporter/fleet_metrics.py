@@ -19,7 +19,7 @@ forty series, and one more for each kind of command and refusal. Anybody on an o
 of a whole hall has some dozens of cars."""
 MAX_RECENT_RECORDS: Final = 4096
 """Maximum number of remembered records of commands. They are remembered so that each phase counts once: if a car cannot
-show the effect of a command, the command ends with a second `sent`: a stop at most 23 s later
+show the effect of a command, the command ends with a second `sent`: a stop some 23 s later at most
 (schemas.limits.MAX_EVIDENCE_TIMEOUT_S and its worst case), a drive at its end. The number is enough for 170 records a
 second, and a stop has at least two."""
 _REFUSALS: Final = frozenset({Phase.EXPIRED, Phase.FAILED, Phase.REJECTED})

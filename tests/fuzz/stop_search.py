@@ -812,11 +812,13 @@ class Episode:
         """Return the maximum time from the request of a stop to its end, as docs/reference/protocol.md has it.
 
         The gateway assumes that `MODE00` blocks for 1 s until it has learned this car's block, which may be after the
-        stop began. On a link that loses reports it learns a slower rhythm than the car has.
+        stop began. On a link that loses reports it learns a slower rhythm than the car has. At the end of its time, a
+        stop that is just being shown waits for the end of the silence that shows it.
         """
         traits, model = self.plan.traits, self.control.driver.model
         true_s = EVIDENCE_INTERVALS * (traits.interval_s + traits.spread_s + max(1.0, traits.close_s) + 0.1)
-        return 5.5 + max(min(true_s, MAX_EVIDENCE_TIMEOUT_S), evidence_s(model.profile, model.learned))
+        timeout_s = max(min(true_s, MAX_EVIDENCE_TIMEOUT_S), evidence_s(model.profile, model.learned))
+        return 5.5 + timeout_s + model.evidence.settling_s
 
     @property
     def _shows(self) -> bool:

@@ -25,7 +25,7 @@ longer): three that may be needed (because one may be in doubt), one for the rep
 after them. The maximum of the timeout is `MAX_EVIDENCE_TIMEOUT_S`."""
 MAX_ANNOUNCED_WORST_S: Final = 5.0
 """Maximum of the worst case that is added to the timeout for the evidence, so that nobody waits longer than 17 s for an
-answer, or 23 s with the slowest car."""
+answer, or 23 s with the slowest car. If a silence that may show the stop has just begun, its end is awaited, too."""
 # The silence between two tries is longer than any block outside obstacle avoidance, so the car reads the next frame
 # alone. Except on a slow car, it becomes 6.5 s at most, so the car reads at least one of two tries within 15 s after
 # the end of a fault.
