@@ -18,7 +18,7 @@ force do.
 
 Third: who gets which role? That is a small assignment problem (`role_allocation`). Filled roles of high priority count
 most, then cars that keep their role, then few changes of mode. A car may be replaced if it has twice failed to change
-to its mode.
+to its mode, and is then the last choice for that mode for a while.
 
 Only then come commands, and only commands that change something. A car that is in its mode is not commanded again. If
 it does not change to the mode, the command is retried at growing intervals. Everything that lasts from one step to the
@@ -72,14 +72,13 @@ from fleet.policy.state import (
     LedRequest,
     ModeAttempts,
     PolicyState,
+    note_failures,
 )
 from schemas.colors import COLORS, Rgb
 from schemas.words import UNKNOWN, LinkState, Mode, Verdict
 
 FIRST_STATE_TIMEOUT_S: Final = 1.5
 """Timeout for the first states of the cars on the bus. The first roles wait for these states."""
-ATTEMPTS_BEFORE_REPLACEMENT: Final = 2
-"""Number of failed mode commands after which another car may take over the role."""
 
 
 class CarCommand(Struct, frozen=True):
@@ -132,7 +131,8 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
     needs = follow_needs(plan, snapshot, subjects, memory.needs, now)
     # A decision says when it would change. That depends on the phase, so drop the decisions of another phase.
     reusable = memory.decisions if phase.name == memory.phase.name else {}
-    memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since)
+    failed_modes = note_failures(memory.failed_modes, memory.mode_attempts, snapshot, barriers, now)
+    memory = replace(memory, rules=rules, phase=phase, needs=needs, gone_since=gone_since, failed_modes=failed_modes)
     if now - started_at < FIRST_STATE_TIMEOUT_S and any(
         has_no_state(snapshot.cars.get(car, UNKNOWN_CAR)) for car in subjects
     ):
@@ -145,11 +145,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
         free=free,
         reserved=reserved,
         roles_before=roles_before,
-        unresponsive=frozenset(
-            car
-            for car, attempts in memory.mode_attempts.items()
-            if attempts.failed(now, busy=snapshot.cars.get(car, UNKNOWN_CAR).busy) >= ATTEMPTS_BEFORE_REPLACEMENT
-        ),
+        failed_modes=frozenset(failed_modes),
         pinned=pinned_roles(plan, rules, subjects),
         in_force=frozenset(plan.roles) if roles_in_force is None else roles_in_force,
         needs=needs,
@@ -311,10 +307,7 @@ def _explain_loss(
     barrier = barriers.get(car) or candidates.barrier(car, role)
     if barrier is not None:
         return barrier.why
-    if (
-        car in candidates.unresponsive
-        and candidates.snapshot.cars.get(car, UNKNOWN_CAR).verdict == Verdict.CONTRADICTED
-    ):
+    if candidates.has_failed(car, role):
         return f"{car} was asked for mode {role.mode} again and again, and is not in it"
     other = allocation.roles.get(car)
     return f"{car} has role {other} now" if other is not None else f"{car} fits it less"

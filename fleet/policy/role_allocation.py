@@ -71,9 +71,8 @@ class Candidates(Struct, frozen=True):
     """Cars that cannot be commanded for a moment, each with the role that is reserved for it."""
     roles_before: Mapping[str, str]
     """The role of each car before this step."""
-    unresponsive: frozenset[str]
-    """Cars that were commanded into their mode more than once and, if they are not in it now, have failed to change to
-    it. A car is no longer among them once it has stayed in its mode for a while."""
+    failed_modes: frozenset[tuple[str, str]]
+    """Cars and the modes that they have lately failed to change to (`state.note_failures`)."""
     pinned: Mapping[str, PinnedRole]
     """The roles that rules pin, by car."""
     in_force: frozenset[str]
@@ -99,6 +98,12 @@ class Candidates(Struct, frozen=True):
             return Barrier("only a rule gives it", "a rule gives it to the car")
         known = self.snapshot.cars.get(car, UNKNOWN_CAR)
         return find_barrier(known, role, self.now) or self._needy(car, role, known)
+
+    def has_failed(self, car: str, role: Role) -> bool:
+        """Return True if the car has lately failed to change to the mode of the role, and is not in it now."""
+        known = self.snapshot.cars.get(car, UNKNOWN_CAR)
+        is_in_mode = known.mode == role.mode and known.verdict != Verdict.CONTRADICTED
+        return (car, role.mode) in self.failed_modes and not is_in_mode
 
     def _needy(self, car: str, role: Role, known: CarSnapshot) -> Barrier | None:
         if role.needs is None:
@@ -272,9 +277,11 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
             elif candidates.barrier(car, role) is not None:
                 continue
             cost = order - worth[_rank(role)]
-            if car in candidates.unresponsive and known.verdict == Verdict.CONTRADICTED and role.count is not None:
-                cost += _ROLE_LOSS_COST
-            elif candidates.roles_before.get(car) == role.name:
+            is_holder = candidates.roles_before.get(car) == role.name
+            if role.count is not None and candidates.has_failed(car, role):
+                # Of several cars that have failed, the holder stays. Otherwise they would take turns.
+                cost += _ROLE_LOSS_COST - (2 * _MODE_CHANGE_COST if is_holder else 0)
+            elif is_holder:
                 # The loss of a role for all cars counts half, so that its holder may move to a role with a number.
                 cost -= _ROLE_LOSS_COST if role.count is not None else _ROLE_LOSS_COST // 2
             if known.mode != role.mode or known.verdict == Verdict.CONTRADICTED:

@@ -1,6 +1,6 @@
 """The state of the coordinator between decisions, and the part that outlives a change of plan or a restart. Pure."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Final
 
 from msgspec import Struct, field
@@ -15,7 +15,7 @@ from fleet.policy.rules_in_force import RuleState
 from fleet.policy.snapshot import UNKNOWN_CAR, FleetSnapshot
 from schemas.backoff import backoff_s
 from schemas.colors import Rgb
-from schemas.words import Mode
+from schemas.words import Mode, Verdict
 
 TAKEN_OVER: Final = "it had it before the coordinator was started again"
 """Reason for a role that a car had before a restart of the coordinator."""
@@ -24,6 +24,10 @@ HUB_RETURN_GRACE_S: Final = 5.0
 reconnect every 0.5 s."""
 MODE_RETRY_MAX_S: Final = 30.0
 """Maximum retry interval of a mode command. The interval doubles from 1 s with each attempt."""
+ATTEMPTS_BEFORE_REPLACEMENT: Final = 2
+"""Number of failed mode commands after which another car may take over the role."""
+FAILED_MODE_KEPT_S: Final = 60.0
+"""Time for which a car that has failed to change to a mode is the last choice for a role with this mode."""
 IN_PHASE: Final = "it was so before the coordinator was started again"
 
 
@@ -46,6 +50,32 @@ class ModeAttempts(Struct, frozen=True):
         The last one may still succeed while it has no outcome (`busy`), or was sent only a moment ago.
         """
         return self.count - (busy or now < self.again_at)
+
+
+def note_failures(
+    failed_modes: Mapping[tuple[str, str], float],
+    attempts: Mapping[str, ModeAttempts],
+    snapshot: FleetSnapshot,
+    alone: Container[str],
+    now: float,
+) -> dict[tuple[str, str], float]:
+    """Return the modes that cars have failed to change to, with those that they fail to change to now.
+
+    A failure is remembered also while the car has no role. Otherwise two broken cars would take turns in a role, while
+    a third one that works has none. It is forgotten after a while, and when the car is left `alone`: somebody may have
+    mended it, or its gateway is new.
+    """
+    found = {
+        (car, mode): at
+        for (car, mode), at in failed_modes.items()
+        if now - at < FAILED_MODE_KEPT_S and car not in alone
+    }
+    for car, each in attempts.items():
+        known = snapshot.cars.get(car, UNKNOWN_CAR)
+        is_contradicted = known.verdict == Verdict.CONTRADICTED and car not in alone
+        if is_contradicted and each.failed(now, busy=known.busy) >= ATTEMPTS_BEFORE_REPLACEMENT:
+            found[car, each.mode] = now
+    return found
 
 
 class HeldRole(Struct, frozen=True):
@@ -107,6 +137,9 @@ class PolicyState(Struct, frozen=True):
     needs: Mapping[tuple[str, str], Settled] = field(default_factory=dict)
     """By car and role: True if the car meets the role's needs."""
     mode_attempts: Mapping[str, ModeAttempts] = field(default_factory=dict)
+    """By car."""
+    failed_modes: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    """By car and mode: the last time at which the car was not in this mode after two commands. See `note_failures`."""
     led_requests: frozenset[LedRequest] = frozenset()
     blinks: Mapping[str, BlinkState] = field(default_factory=dict)
     """By car."""
