@@ -1,4 +1,4 @@
-"""The profile of a platform: its driver says in it what such cars can do. Pure; `gateway.drivers` has the profiles."""
+"""The profile of a platform, in which its driver says what cars of this platform can do. `gateway.drivers` has them."""
 
 from typing import Protocol
 
@@ -6,7 +6,7 @@ from schemas.words import Light, Mode, ServoAction
 
 
 class CarProfile(Protocol):
-    """Says what cars of one kind can do. There is one object for each name of a platform, with its options."""
+    """Says what cars of one kind can do. There is one for each platform with its options, such as `arduino+arm`."""
 
     def __hash__(self) -> int:
         """Return a hash. Profiles are values: two profiles of the same name are equal."""
@@ -29,7 +29,7 @@ class CarProfile(Protocol):
 
     @property
     def possible_modes(self) -> frozenset[Mode]:
-        """The modes that the car may be in, whoever opened them."""
+        """The modes that the car may be in, whoever has switched them on."""
 
     @property
     def lights(self) -> frozenset[Light]:
@@ -37,7 +37,7 @@ class CarProfile(Protocol):
 
     @property
     def servos(self) -> frozenset[ServoAction]:
-        """The steps of the car's servos."""
+        """The actions that the car's servos can carry out."""
 
     @property
     def has_readings(self) -> bool:
@@ -53,24 +53,24 @@ class CarProfile(Protocol):
 
     @property
     def dead_man_s(self) -> float | None:
-        """The time after which the car stops by itself if nothing drives it, or None if it drives on."""
+        """The time after which the car stops by itself without a new command, s. None if it drives on."""
 
     @property
     def not_observed(self) -> tuple[str, ...]:
-        """Sentences about such cars that were only read or assumed. Empty if everything was observed on a car."""
+        """What is said of such cars but was only read somewhere or assumed, as sentences. Empty if there is nothing."""
 
     @property
     def has_network(self) -> bool:
-        """True if a TCP port is the car's own. False if it belongs to a bridge, which outlives its clients."""
+        """True if a TCP link ends at the car itself. False if it ends at a bridge, which runs on without clients."""
 
     def measurable(self, mode: Mode) -> frozenset[str]:
         """Return the names of all readings that the car can send in this mode: `range`, `battery`, `line`, ..."""
 
     def why_lacking(self, capability: str) -> str | None:
-        """Return a sentence on why the car lacks a capability. None if it has it, or if there is no such capability."""
+        """Return a sentence on why the car lacks a capability. None if the car has it, or if there is none such."""
 
     def hint(self, odd: str) -> str:
-        """Return the likely cause of something odd in such cars, as a sentence. Empty if the platform has none.
+        """Return the likely cause of something odd in such cars, as a sentence. Empty if the driver knows none.
 
         `odd` is a finding of `fleet doctor` (`silent`, `not_obeyed`), or a field whose values are always out of range.
         """

@@ -53,8 +53,11 @@ class StartEntry(Entry):
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
 
 
-def _place(unless: str, offset: str) -> Any:
-    """Return a coordinate of a thing or a lamp. `unless` says when it may be left out, `offset` what it means."""
+def _coordinate(unless: str, offset: str) -> Any:
+    """Return a coordinate of a thing or a lamp.
+
+    `unless` says when it may be left out, `offset` what it means if the thing or lamp is carried.
+    """
     words = f"where it stands, meters, required unless {unless}; if carried, how far {offset}"
     return Field(default=0.0, description=words)
 
@@ -62,10 +65,10 @@ def _place(unless: str, offset: str) -> Any:
 class ThingEntry(Entry):
     """A disc or a box that stands, moves along a path, or is carried by a car."""
 
-    # A field whose default means nothing has a default factory, so that the schema for editors shows no default.
+    # If the default of a field has no meaning, the field has a default factory, so that editors show no default.
     # `world_check` reports fields that are missing or not allowed.
-    x_m: _Place = _place("it has a path or is carried", "ahead of the car's middle")
-    y_m: _Place = _place("it has a path or is carried", "to the left of the car's middle")
+    x_m: _Place = _coordinate("it has a path or is carried", "ahead of the car's middle")
+    y_m: _Place = _coordinate("it has a path or is carried", "to the left of the car's middle")
     heading_deg: _Degrees = Field(default=0.0, description="its direction, degrees counter-clockwise from x")
     radius_m: _Size = Field(default_factory=float, description="radius of a disc, meters")
     width_m: _Size = Field(default_factory=float, description="width of a box, meters, instead of `radius_m`")
@@ -74,9 +77,12 @@ class ThingEntry(Entry):
         default_factory=list,
         min_length=2,
         max_length=_MAX_ITEMS,
-        description="the points [x, y] of its path; after the last one it moves straight back to the first",
+        description="the points [x, y] of its path; after the last one it moves straight back to the first, unless "
+        "`there_and_back` is true",
     )
-    there_and_back: bool = Field(default=False, description="true: at the end of its path it goes back the same way")
+    there_and_back: bool = Field(
+        default=False, description="true: from the last point of its path it goes back the same way"
+    )
     speed_m_s: float = Field(default=0.0, ge=0, le=0.5, description="its speed along the path, m/s")
     waits_for_m: float = Field(
         default_factory=float, ge=0, le=100, description="it moves only while a car is within this distance, meters"
@@ -87,10 +93,10 @@ class ThingEntry(Entry):
 class LampEntry(Entry):
     """A lamp that the light sensors see, if nothing is in between."""
 
-    x_m: _Place = _place("it is carried", "ahead of its carrier's middle")
-    y_m: _Place = _place("it is carried", "to the left of its carrier's middle")
+    x_m: _Place = _coordinate("it is carried", "ahead of its carrier's middle")
+    y_m: _Place = _coordinate("it is carried", "to the left of its carrier's middle")
     reach_m: float = Field(
-        default=1.5, gt=0, le=100, description="distance from which it is seen with brightness 1, meters"
+        default=1.5, gt=0, le=100, description="distance from which a lamp of brightness 1 is seen, meters"
     )
     brightness: float = Field(
         default=1.0, ge=0, le=100, description="how bright it is: with 4, it is seen from twice as far as with 1"
@@ -101,7 +107,7 @@ class LampEntry(Entry):
 
 
 class WorldEntry(Entry):
-    """Where simulated cars drive, in meters, m/s, and degrees counter-clockwise from x. The middle is (0, 0)."""
+    """Where simulated cars drive, in meters, m/s, and degrees counter-clockwise from x. Its middle is (0, 0)."""
 
     room: RoomEntry = Field(
         default_factory=RoomEntry.model_construct, description="four walls around (0, 0); left out: no walls"

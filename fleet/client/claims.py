@@ -4,7 +4,8 @@ A car acknowledges nothing, so each such statement is a claim. It has a basis (t
 frames that were sent), a time since which it has been true, and an age: the time since its gateway published it. The
 last claims of a gateway that has ended are shown as past ones, with their age, and never as present ones.
 
-Lists, status, shutdown, doctor, console and Python all use these texts, so that a car is described everywhere alike.
+Lists, status, shutdown, doctor, console and Python all use these texts, so that a car is described in the same words
+everywhere.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,8 @@ STOPPED: Final = "stopped"
 STOP_SENT: Final = "stop sent"
 """How the text about a stop begins if the frames of the stop were sent, and nothing shows the stop."""
 NOT_CONFIRMED: Final = "NOT CONFIRMED"
-"""How the text about a stop begins if readings should have shown the stop, but did not. `STOP_SENT` may come before."""
+"""How the text about a stop begins if readings should have shown the stop, but did not. If the
+frames of the stop were sent, `STOP_SENT` may come before it."""
 NOT_STOPPED: Final = "NOT STOPPED"
 """How the text about a stop begins if the stop did not reach the car, which may be moving."""
 NO_GATEWAY: Final = "no gateway"
@@ -39,7 +41,7 @@ class CarClaim(Struct, frozen=True):
     since_s: float | None = None
     """How long it has been so. None if that is not known."""
     age_s: float | None = None
-    """Time since the gateway published it. None if the gateway never did."""
+    """Time since the gateway published it. None if it never did, or if the age is not known."""
     why: str = ""
     """The evidence or the cause, for a person."""
     past: "CarClaim | None" = None
@@ -61,7 +63,7 @@ class CarClaim(Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        """The claim as a sentence without a period: what, basis, since when, why."""
+        """The claim as a sentence without a period: what, basis, for how long, why."""
         if self.past is not None and self.past.age_s is not None:
             return f"{self.what}: its gateway is gone, and said {self.past.short} {describe_age(self.past.age_s)} ago"
         since = f" for {describe_age(self.since_s)}" if self.since_s is not None else ""
@@ -104,7 +106,7 @@ def link_claim(link: Any, age_s: float = 0.0, *, present: bool = True) -> CarCla
     return claim if present else CarClaim(NO_GATEWAY, past=claim)
 
 
-def rest_words(motors: CarClaim, car: str) -> str:
+def describe_stop(motors: CarClaim, car: str) -> str:
     """Describe what a gateway's last claim says about the car's stop: stopped, stop sent, or not confirmed."""
     if motors.what != Motors.OFF:
         return f"{NOT_CONFIRMED}: {car} has not shown that it stopped"
@@ -137,10 +139,13 @@ def describe_bars(estops: Sequence[str], hold: str, paused_by: str, lent_to: str
 
 
 def _claim(topic: str, age_s: float, what: str, basis: str, since_s: float | None, why: str) -> CarClaim:
-    """Return a claim from a message of this age. When it was sent, the claim had been true for `since_s`."""
+    """Return a claim from a message of this age.
+
+    `since_s` is how long the claim had been true when the message was sent.
+    """
     after_s = topics.TOPICS[topic].stale_after_s
     is_stale = after_s is not None and age_s > after_s
-    if isinf(age_s):  # its stamp gives no age
+    if isinf(age_s):  # the stamp of the message cannot be used
         return CarClaim(what, basis, why=why, is_stale=is_stale)
     return CarClaim(what, basis, None if since_s is None else since_s + age_s, age_s, why, is_stale=is_stale)
 
@@ -165,7 +170,7 @@ class CarClaims(Struct, frozen=True):
 def claims_of(
     states: Mapping[str, Any], ages_s: Mapping[str, float] | None = None, *, present: bool = True
 ) -> CarClaims:
-    """Return the claims about a car. `states` are the newest messages by topic, with their ages."""
+    """Return the claims about a car. `states` are the newest messages by topic, `ages_s` their ages."""
     ages = ages_s or {}
 
     def message_and_age(topic: str) -> tuple[Any, float]:
@@ -184,6 +189,6 @@ def describe_end_of_doubt(car: str) -> str:
     No plan uses the car until then.
     """
     return (
-        f"`fleet stop {car}` ends the doubt if the car then shows its stop, `fleet resume {car}` if a person has "
-        "looked at the car."
+        f"`fleet stop {car}` ends the doubt if the car then shows its stop. If a person has looked at the car, "
+        f"`fleet resume {car}` ends it."
     )

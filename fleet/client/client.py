@@ -117,14 +117,15 @@ class Fleet:
     the sender, `person@host-pid` by default. `kind` is the rank of the sender: `script`, `person` (outranks scripts) or
     `coordinator`. `start_hub`: start a hub on this computer if none runs. `identity` is the owner of the certificate to
     use, such as `service.coordinator` (default: the user). If a person owns the certificate, commands are sent in this
-    person's name, and another `person` or `sender` raises keys.BadKey.
+    person's name, and a different `person` or `sender` raises keys.BadKey.
 
     While a Fleet is open, it has the liveliness token `<fleet>/@operator/<sender>` on the bus. If the token disappears,
-    for example because the program has crashed, gateways end the drives of this client, and stop these cars. Modes that
-    it has opened go on. So use a Fleet in a `with` block, or call `close`. Otherwise the script ends with a
-    ResourceWarning. A forked process needs a Fleet of its own: one from before the fork raises BusError there.
+    for example because the program has crashed, gateways end the drives of this client, and stop the cars that it
+    drives. Modes that it has switched on go on. So use a Fleet in a `with` block, or call `close`. Otherwise the script
+    ends with a ResourceWarning. A forked process needs a Fleet of its own: one that was opened before the fork raises
+    BusError there.
 
-    Raises schemas.bus.BusError if there is no fleet, keys.BadKey for a bad name.
+    Raises schemas.bus.NoFleet (a BusError) if there is no fleet, keys.BadKey for a bad name.
     """
 
     def __init__(
@@ -278,8 +279,8 @@ class Fleet:
         """Wait until the condition `when` is true for a reading, and return it.
 
         The current reading counts, too, unless it is stale. With `for_s`, the condition must have been true in all
-        readings of this time, by their stamps. Without `timeout_s`, wait for ever. Raises wait.NotInTime (a
-        TimeoutError), conditions.BadExpression, and BusError if this Fleet is closed meanwhile.
+        readings of the last `for_s` seconds, by their stamps. Without `timeout_s`, wait for ever. Raises wait.NotInTime
+        (a TimeoutError), conditions.BadExpression, and BusError if this Fleet is closed meanwhile.
         """
         key_expression = self.expression(expression)
         waiting = ConditionWait(KeyCondition.of(when, key_expression), for_s)
@@ -508,8 +509,8 @@ class Car(CarCommands[Outcome]):
 
         Within the block, nobody of the same or a lower rank can drive the car, unless a person takes it over. At its
         end, the car is stopped and released. In the block, a command that is not carried out raises NotCarriedOut. Once
-        another sender has taken or stopped the car, every command raises LeaseLost. Either can also be raised when the
-        block begins.
+        another sender has taken or stopped the car, every command raises LeaseLost. Both errors can also be raised
+        when the block begins.
         With `take`, a person (`Fleet(kind="person")`) takes the car over from another person.
         """
         return Lease(self._fleet, self.name, partial(LeasedCar, self._fleet, self.name), take=take)

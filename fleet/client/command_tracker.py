@@ -19,10 +19,10 @@ ANSWER_TIMEOUT_S: Final = 2.0
 WAIT_SAID_S: Final = 1.0
 """Time after which the user is told that a command waits for a busy car."""
 SEND_AGAIN_INTERVAL_S: Final = 0.5
-"""Delay before a stop is sent again whose last query has ended without an answer. A Zenoh session that has lost its hub
-tries to connect again at least as often."""
+"""Delay before a stop is sent again, if its last query has ended without an answer. A Zenoh session that has lost its
+hub tries to connect again at least as often."""
 BUS_LOOK_INTERVAL_S: Final = 0.1
-"""Interval at which a stop without an answer checks whether the bus is there, or was lost meanwhile."""
+"""Interval at which, while a stop has no answer, it is checked whether the bus was lost."""
 _MAX_QUEUED_ITEMS: Final = 4096
 """Maximum number of unread answers and events of a command. Each of up to some hundred cars sends a few."""
 
@@ -47,7 +47,7 @@ class PresenceChange:
 
 
 class SupervisedCars:
-    """The cars whose gateways a supervisor runs, and the cars that were on the bus when it answered.
+    """The cars whose gateways a supervisor runs, and the cars that were on the bus when the supervisor answered.
 
     Without a supervisor, `names` is empty.
     """
@@ -68,10 +68,11 @@ class PendingCommand:
 
     # A stop must not miss a car whose gateway hangs: after 2 s its token (the sign that it is on the bus) is gone, and
     # a wildcard query no longer reaches it. Therefore a stop is also for the cars that a supervisor knows, and is sent
-    # again to their new gateways. A stop could also be lost with the bus: a hub that hangs accepts the query, and drops
-    # it when Zenoh takes the hub for dead (after its lease, 2 s) and cuts the hub's links. So a stop that a gateway has
-    # not answered is sent again when the bus is back, as long as gateways accept a stop of that age (STOP_TTL_S). A car
-    # that has answered does not get the stop again, because a person may have released the car meanwhile.
+    # again to the gateways that it starts for them. A stop could also be lost with the bus: a hub that hangs accepts
+    # the query, and the query is lost when Zenoh, after 2 s without a sign of life, closes the links to the hub. So a
+    # stop that a gateway has not answered is sent again when the bus is back, as long as gateways accept a stop of that
+    # age (STOP_TTL_S). A car that has answered does not get the stop again, because a person may have released the car
+    # meanwhile.
 
     def __init__(
         self,
@@ -92,12 +93,12 @@ class PendingCommand:
         self._read_link = read_link
         self._link_then = read_link()
         self._link_when_gone: dict[str, str] = {}
-        """Our link to the hub when a gateway was lost, by car."""
-        self.is_taken: Future[bool] = Future()
-        """True as soon as a gateway has answered, or no outcome is awaited any more. False if the bus was lost or the
-        Fleet was closed before a gateway answered."""
+        """For each car whose gateway was lost: our link to the hub at that moment."""
+        self.arrived: Future[bool] = Future()
+        """True as soon as a gateway has answered, or when `wait` ends without an answer. False if `wait` ends so
+        because the bus was lost or the Fleet was closed."""
         self.lost_bus = False
-        """True if the bus was lost before the stop was answered."""
+        """True if the bus was lost before all gateways had answered the stop."""
         self._bus_back_at: float | None = None
         """The time at which the bus came back. None if it is still lost, or was not lost."""
         self._unanswered_at: dict[str, float] = {}
@@ -115,7 +116,7 @@ class PendingCommand:
             if car not in present and not self.is_stop:
                 self._progress[car].on_missing(present, self._asked_at)
         self.targets = ["*"] if named is None else [car for car in named if car in present]
-        self._open = len(self.targets) + self.is_stop
+        self._open_queries = len(self.targets) + self.is_stop  # a stop also asks the supervisor
 
     def outcomes(self) -> list[Outcome]:
         """Return the outcomes, sorted by car."""
@@ -129,8 +130,8 @@ class PendingCommand:
                 self._look_for_bus(time.monotonic())
             waiting = [progress for progress in self._progress.values() if progress.outcome is None]
             # A car without a token may answer a wildcard query, too. So also wait for the end of the query.
-            if not waiting and not self._open and not self._awaits_bus:
-                self._note_taken(taken=not self.lost_bus and not self._is_closed)
+            if not waiting and not self._open_queries and not self._awaits_bus:
+                self._note_arrival(arrived=not self.lost_bus and not self._is_closed)
                 return
             now = time.monotonic()
             if self._late_at is not None and now >= self._late_at:
@@ -138,15 +139,16 @@ class PendingCommand:
                 self._warn_of_missing_answers(waiting)
             waits_at = self._asked_at + WAIT_SAID_S
             if now >= waits_at:
-                self._say_waits(waiting)
+                self._warn_of_waits(waiting)
             for progress in waiting:
                 if progress.is_awaited and now >= progress.deadline and not progress.awaits_bus:
                     link = self._read_link()
                     if link != self._link_when_gone.get(progress.car, self._link_then):
-                        # Its gateway may still be there: our own link was lost. Excuse the gateway only once for it.
+                        # The gateway may still be there, because our own link was lost. Give it more time, but only
+                        # once for each loss of our link.
                         self._link_when_gone[progress.car] = link
                         progress.on_presence(now, alive=True)
-                if now >= progress.deadline and self.inbox.empty():  # after a stall, its answer may be in the queue
+                if now >= progress.deadline and self.inbox.empty():  # after a stall of this thread, it may be there
                     progress.give_up(now)
             due = [each.deadline for each in waiting] or [now + ANSWER_TIMEOUT_S]
             if self._late_at is not None:
@@ -159,7 +161,7 @@ class PendingCommand:
                 at, item = self.inbox.get(timeout=max(0.0, min(due) - now))
             except queue.Empty:
                 continue
-            self._take(item, at)
+            self._handle(item, at)
 
     def abandon(self) -> None:
         """Make `wait` return at once, because nobody needs the outcome any more.
@@ -182,9 +184,9 @@ class PendingCommand:
         return self._bus_back_at is None or now < self._bus_back_at + GATEWAY_RETURN_TIMEOUT_S
 
     def _look_for_bus(self, now: float) -> None:
-        """Note if the bus was lost before all gateways have answered.
+        """Note that the bus was lost, if not all gateways have answered yet.
 
-        Send the stop again to the cars without an answer.
+        If it is there, send the stop again to cars whose last query has ended without an answer.
         """
         unanswered = [each for each in self._progress.values() if each.outcome is None and not each.answered]
         if not (link := self._read_link()):
@@ -202,29 +204,29 @@ class PendingCommand:
             if ended_at is not None and now >= ended_at + SEND_AGAIN_INTERVAL_S and progress.car in self._present:
                 self._stop_again(progress)
 
-    def _note_taken(self, *, taken: bool) -> None:
-        if not self.is_taken.done():
-            self.is_taken.set_result(taken)
+    def _note_arrival(self, *, arrived: bool) -> None:
+        if not self.arrived.done():
+            self.arrived.set_result(arrived)
 
     def _warn_of_missing_answers(self, waiting: list[Progress]) -> None:
         if late := sorted(progress.car for progress in waiting if not progress.answered):
             why = "The fleet's bus does not answer" if self.lost_bus else "Computer or gateway may be overloaded"
             log.warning("%s: no answer yet, still waiting. %s.", ", ".join(late), why)
 
-    def _say_waits(self, waiting: list[Progress]) -> None:
+    def _warn_of_waits(self, waiting: list[Progress]) -> None:
         for progress in waiting:
             if progress.waits and progress.car not in self._waits_said:
                 self._waits_said.add(progress.car)
                 log.warning("%s: %s", progress.car, progress.waits)
 
-    def _take(self, item: Any, at: float) -> None:
+    def _handle(self, item: Any, at: float) -> None:
         if item is CLOSED:
-            self._open = 0
+            self._open_queries = 0
             self._is_closed = True
             for progress in self._progress.values():
                 progress.give_up(at)
         elif isinstance(item, QueryEnded):
-            self._open -= 1
+            self._open_queries -= 1
             for progress in self._progress.values():
                 if item.target not in ("*", progress.car):
                     continue
@@ -240,12 +242,12 @@ class PendingCommand:
         elif isinstance(item, PresenceChange):
             self._on_presence(item, at)
         elif isinstance(item, SupervisedCars):
-            self._open -= 1
+            self._open_queries -= 1
             self._on_supervised(item, at)
         elif self._named is None or self.concerns(item.car):
-            self._note_taken(taken=True)
-            # If a resume ends an e-stop of the whole fleet, gateways tell each other, with the id of this command. So
-            # this event may be of a car to which the command was not sent.
+            self._note_arrival(arrived=True)
+            # If a resume ends an e-stop of the whole fleet, gateways pass it on to each other under the id of the
+            # resume. So the event may be about a car to which the command was not sent.
             self._of(item.car).on_event(item.phase, item.reason, item.words, item.worst_case_s, at, item.basis)
 
     def _on_presence(self, change: PresenceChange, at: float) -> None:
@@ -266,7 +268,10 @@ class PendingCommand:
             self._stop_again(progress)
 
     def _on_supervised(self, supervised: SupervisedCars, at: float) -> None:
-        """Wait for the new gateways of these cars. Give up on named cars that nobody knows."""
+        """Note that these cars get new gateways. Give up on named cars that are neither supervised nor on the bus.
+
+        Send the stop to cars on the bus that the query has missed.
+        """
         queried = set(self._progress) if self._named is None else set(self.targets)
         present = self._present | supervised.present
         for car in supervised.names if self._named is None else self._named:
@@ -281,7 +286,7 @@ class PendingCommand:
     def _stop_again(self, progress: Progress) -> None:
         """Send the stop again to a car without an answer. The first query may not have reached its gateway."""
         if self.is_stop and not progress.answered and progress.outcome is None:
-            self._open += 1
+            self._open_queries += 1
             self._unanswered_at.pop(progress.car, None)
             self._send_again(progress.car)
 
@@ -292,7 +297,7 @@ class PendingCommand:
         except messages.BadPayload as error:
             progress.on_foreign_answer(f"another program answered for {progress.car}: {error}")
             return
-        self._note_taken(taken=True)
+        self._note_arrival(arrived=True)
         progress.on_answer(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
 
     def _of(self, car: str) -> Progress:

@@ -205,7 +205,7 @@ class CarCommands(ABC, Generic[R]):
         """Send one command. The methods below make the requests."""
 
     def drive(self, motion: str, duration_s: float = 0.5, *, wait: bool = True) -> R:
-        """Drive `forward, back, left, right, spin_left, spin_right` for `duration_s`; `stop` ends the motion.
+        """Drive `forward, back, left, right, spin_left, spin_right` for `duration_s`, or end the motion with `stop`.
 
         The duration is more than 0 s and at most 10 s, unless the gateway was started with another `--longest-drive`.
         At the end of the drive, the gateway stops the car, and the call returns. With `wait=False`, the call returns
@@ -226,7 +226,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(light_request(light))
 
     def servo(self, servo: str, action: str = "", deg: int | None = None) -> R:
-        """Turn a servo: the front servo to its end, those of a camera by one step, each to its middle (`reset`).
+        """Turn a servo: the front servo to its end, a camera's servo by one step, any servo to its middle (`reset`).
 
         `servo` is `front` or `horizontal`, with the actions left, right and reset; or `vertical`, with up, down and
         reset. Instead of an action, `front` accepts an angle: `deg`, 0..180.
@@ -254,7 +254,7 @@ class CarCommands(ABC, Generic[R]):
         return self.do(stop_request())
 
     def estop(self, why: str = "") -> R:
-        """Emergency-stop the car: it accepts only stops until the e-stop ends.
+        """Emergency-stop the car: it accepts only stops and `resume` until the e-stop ends.
 
         To end it, call `resume` with its id, or with `everything`.
         """
@@ -276,5 +276,5 @@ class CarCommands(ABC, Generic[R]):
         return self.do(end_loan_request())
 
     def find(self) -> R:
-        """Let the car blink, and beep if it can, to see which one it is. It does not move."""
+        """Let the car blink, and beep if it can, so that people see which one it is. It does not move."""
         return self.do(plain_request(Verb.FIND))

@@ -60,7 +60,7 @@ class Reading:
 
     @property
     def car(self) -> str:
-        """The car's name, or that of a service such as `@coordinator`. Empty for logs, which have no such field."""
+        """The car's name, or that of a service such as `@coordinator`. Empty for logs: no message of one names it."""
         return getattr(self.value, "car", "")
 
     def __getitem__(self, field: str) -> Any:

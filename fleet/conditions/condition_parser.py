@@ -1,7 +1,7 @@
 """Parses the text of a condition into its tree. Each error has a column and says what is allowed. Pure.
 
-condition:  comparisons, yes/no fields, true and false, joined by `not`, `and`, `or` (binding in this order) and ()
-comparison: < <= > >= between numbers, == and != between two numbers, two words or two truths
+condition:  comparisons, yes/no fields, true and false, with `not` (binds first), `and`, `or` (binds last), and ()
+comparison: < <= > >= between numbers, == and != between two numbers, two words or two yes/no values
 words:      in quotes, 'low' or "low", and nothing is escaped in them
 """
 
@@ -95,7 +95,7 @@ class _Token(Struct, frozen=True):
 class _Parser:
     """A recursive-descent parser of one text."""
 
-    # `ast.parse` would not help: errors need the columns of parentheses and missing operands, and names may have dots
+    # `ast.parse` would not help: errors need the columns of parentheses and of missing operands, names may have dots,
     # and words have no escapes.
 
     def __init__(
@@ -136,7 +136,10 @@ class _Parser:
             self._fail(token, f"the word that begins with {rest[0]} has no end")
         number = re.match(r"[+-]?[0-9][0-9.]*", rest)
         if number is not None:
-            self._fail(token, f"{rest.split()[0]} is not a number. Write it without a unit: a field has its own.")
+            self._fail(
+                token,
+                f"{rest.split()[0]} is not a number. Write it without a unit: each field has a fixed one.",
+            )
         wrong = next((wrong for wrong in sorted(_INSTEAD, key=len, reverse=True) if rest.startswith(wrong)), None)
         if wrong is not None:
             self._fail(token, f"{wrong} is not known: write {_INSTEAD[wrong]}")
@@ -232,7 +235,7 @@ class _Parser:
     def _parse_call(self, function: str) -> Name:
         """Parse the rest of `rate(range_m)`.
 
-        The result is a Name, because the caller's lookup evaluates the function.
+        The result is a Name such as `rate(range_m)`: who evaluates the condition looks up its value like a field's.
         """
         token = self._next
         field = None if token.text in self._functions else self._parse_operand()
@@ -267,7 +270,7 @@ class _Parser:
         self._fail(token, f"{token.text} is not a value. {hint}")
 
     def _close_names(self, text: str) -> list[str]:
-        """Return likely names of the kind that is compared here. Names with the text as a part come first."""
+        """Return likely names of the kind that is compared here. Names that have the text between dots come first."""
         expected, fitting = self._expected_kind(), self._fitting_names()
         parts = [name for name in fitting if text in name.split(".")]
         words = [*fitting, *(() if expected not in (None, ValueKind.TRUTH) else _KEYWORDS)]
@@ -281,7 +284,7 @@ class _Parser:
         return [name for name, kind in self._names.items() if expected in (None, KINDS[kind])] or list(self._names)
 
     def _expected_kind(self) -> ValueKind | None:
-        """Return the kind that the name before the next token must have by its neighbors, or None for any kind."""
+        """Return the kind that the last read name must have, judged by the tokens around it. None if any kind fits."""
         before, after = self._at - 2, self._at
         for sign, other in ((after, after + 1), (before, before - 1)):
             if 0 <= sign < len(self._tokens) and self._tokens[sign].text in tuple(Op):
@@ -302,11 +305,11 @@ class _Parser:
         return f"there are {', '.join(listed[:_MAX_NAMES_LISTED])}{more}"
 
     def _check_condition(self, token: _Token, node: Node) -> None:
-        """Fail if a node is a number or a word, which is not a condition."""
+        """Fail if a node is a number or a word, because neither is a condition."""
         kind = kind_of(node)
         if kind is not ValueKind.TRUTH:
             example = f"{node} < 0.3" if kind is ValueKind.NUMBER else f"{node} == 'low'"
-            self._fail(token, f"{node} is {kind}, not a condition: compare it, as {example}")
+            self._fail(token, f"{node} is {kind}, not a condition: compare it, for example {example}")
 
     def _check_comparable(self, sign: _Token, left: tuple[_Token, Node], right: tuple[_Token, Node]) -> None:
         one, other = kind_of(left[1]), kind_of(right[1])
@@ -314,8 +317,8 @@ class _Parser:
             for token, node in (left, right):
                 kind = kind_of(node)
                 if kind is not ValueKind.NUMBER:
-                    bare = ", or stands alone" if kind is ValueKind.TRUTH else ""
-                    self._fail(token, f"{node} is {kind}: {sign.text} compares numbers, this takes == or !={bare}")
+                    bare = ", or let it stand alone" if kind is ValueKind.TRUTH else ""
+                    self._fail(token, f"{node} is {kind}: {sign.text} compares numbers, so use == or !={bare}")
         if one is not other:
             self._fail(sign, f"{left[1]} is {one}, {right[1]} is {other}: they are never the same")
 

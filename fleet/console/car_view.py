@@ -333,7 +333,7 @@ class FleetView:
             del self._cars[car.name]
         return True
 
-    def has_place(self, name: str) -> bool:
+    def may_show(self, name: str) -> bool:
         """Return True if a page may be told of this car."""
         return name in self._cars or name in self._listed
 

@@ -130,7 +130,7 @@ class Console:
         )
         self._plots = PlotFeed(fleet, self.operator.spawn)
         self._lanes = LaneFeed()
-        self._map = MapFeed(self._view.has_place)
+        self._map = MapFeed(self._view.may_show)
         inspections = Inspections(fleet, self._view.look_up)
         self._feeds: Sequence[PageFeed] = (self._plots, self._lanes, self._map, inspections, self.plan)
         self._statuses: Handover[Sample] = Handover(
@@ -283,7 +283,7 @@ class Console:
             if (found := message_in(sample, logging.WARNING)) is not None:
                 key, message = found
                 self._view.on_message(key.car, key.topic, message, now, wall_ns)
-                if self._view.has_place(key.car):
+                if self._view.may_show(key.car):
                     self._lanes.on_message(key, message)
                     self._map.on_message(key, message)
                 if key.topic == "state/safety" and self._report is not None:
@@ -323,7 +323,7 @@ class Console:
             return
         (key, event), now = found, time.monotonic()
         self._view.on_message(key.car, key.topic, event, now)
-        if self._view.has_place(key.car):
+        if self._view.may_show(key.car):
             self._lanes.on_message(key, event)
         if key.topic != "event/command":
             return
@@ -473,7 +473,7 @@ class Console:
         self._view.on_presence(self._present, now)
         at_ms, sender = time.time_ns() // 1_000_000, request.sender or operator.sender
         self._report = StopReport(self._stops, request.verb, sender, self._view.names, now, at_ms)
-        self._newest_stop = operator.stop(request, self._report, self._view.has_place)
+        self._newest_stop = operator.stop(request, self._report, self._view.may_show)
 
     async def is_stop_taken(self) -> bool:
         """Wait until a gateway has answered the newest STOP of all cars. Return False if none answers in time.
@@ -484,7 +484,7 @@ class Console:
         with suppress(TimeoutError):
             async with asyncio.timeout(STOP_ANSWER_TIMEOUT_S):
                 while (command := self._newest_stop) is not None:
-                    taken = await asyncio.shield(asyncio.wrap_future(command.is_taken))
+                    taken = await asyncio.shield(asyncio.wrap_future(command.arrived))
                     if taken or command is self._newest_stop:
                         return taken
         return False

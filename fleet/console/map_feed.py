@@ -17,29 +17,29 @@ from schemas.bus import Latest, Sample
 from schemas.keys import SIMULATOR, Key
 
 TICKS_BETWEEN_MAPS: Final = 2
-"""Five maps a second are enough: they look like motion, and nobody drives by them."""
+"""Of ten ticks a second, each second one: five maps a second look like motion, and nobody steers by the map."""
 _MAX_MAP_KEYS: Final = 1024
 
 
 class MapFeed(PageFeed):
-    """The live map, and the pages that show it. `has_place` returns True if a page may be told of a car."""
+    """The live map, and the pages that show it. `may_show` returns True if pages may be told of a car."""
 
-    def __init__(self, has_place: Callable[[str], bool]) -> None:
+    def __init__(self, may_show: Callable[[str], bool]) -> None:
         self._view = MapView()
-        self._has_place = has_place
+        self._may_show = may_show
         self._samples: Latest[Sample] = Latest(_MAX_MAP_KEYS)
         self._pages: dict[int, float] = {}
-        """The time up to which each page has the trails, by page."""
+        """For each page: the time up to which it has the trails."""
         self._world = ""
         self._ticks = 0
 
     @property
     def messages(self) -> Mapping[str, Handler]:
-        """The messages that show the map on a page, and hide it."""
+        """The messages with which a page shows the map, and hides it, with their handlers."""
         return {"map": self._begin, "map_end": lambda page, _: self.end(page.number)}
 
     def on_sample(self, sample: Sample) -> None:
-        """Note a message of a simulator. Runs on a Zenoh thread."""
+        """Keep a message of a simulator, or of one of its cars, until the next map. Runs on a Zenoh thread."""
         self._samples(sample.key, sample)
 
     def on_message(self, key: Key, message: Any) -> None:
@@ -58,7 +58,7 @@ class MapFeed(PageFeed):
         self._show(page, time.time())
 
     def tick(self, pages: Mapping[int, PageLink]) -> None:
-        """Handle the messages that have come, and show them on the pages with a map."""
+        """At each second tick, handle the messages that have come, and send the map to the pages that show it."""
         self._ticks += 1
         if self._ticks % TICKS_BETWEEN_MAPS:
             return
@@ -68,7 +68,7 @@ class MapFeed(PageFeed):
                 key, message = found
                 if key.car == SIMULATOR:
                     self._view.on_message("", f"{key.car}/{key.topic}", message, now)
-                elif self._has_place(key.car):
+                elif self._may_show(key.car):
                     self._view.on_message(key.car, key.topic, message, now)
         looking = [pages[number] for number in self._pages if number in pages]
         if not looking:
@@ -81,11 +81,11 @@ class MapFeed(PageFeed):
         self._world = world
 
     def end(self, page: int) -> None:
-        """Forget a page."""
+        """Forget a page, by its number."""
         self._pages.pop(page, None)
 
     def _show(self, page: PageLink, now: float) -> None:
-        # This message replaces one that the page has not read yet. The points in that one would be lost, so send all
+        # If the last map has not been sent to the page yet, this one replaces it. Its points would be lost, so send all
         # points again.
         since = 0.0 if page.has_unsent("map") else self._pages[page.number]
         trails = self._view.trails(now, since)

@@ -59,8 +59,8 @@ def format_new_file(cars: Sequence[NewCar]) -> str:
         "# groups: {a: [red, blue]}  # for commands: `fleet stop @a`",
         '# people: {group_a: {drives: ["@a"]}, teacher: {rank: lead}}   # who may drive; left out: everyone',
         "# plan: plan.yaml           # what the cars do together",
-        "# record: {to: sessions, quota: 20GB}   # where `fleet up` records, and how much it keeps; false: it does not",
-        "# pin: [{when: range_m < 0.1}]          # times that the quota takes last, beside stops and marks",
+        "# record: {to: sessions, quota: 20GB}   # where `fleet up` records, and how much it keeps; false: nowhere",
+        "# pin: [{when: range_m < 0.1}]          # what the quota removes last, like stops and marks",
     ]
     return "\n".join(lines) + "\n"
 

@@ -63,16 +63,16 @@ class BadQuery(ValueError):
 
 
 class QueryFailed(RuntimeError):
-    """A question that failed because of memory, disk or files. The text is on one line: DuckDB's, or what to do."""
+    """A question that failed because of memory, disk or files. The text is one line: that of DuckDB, or advice."""
 
 
 class Catalog:
     """The sessions of a directory, for SQL questions: `Catalog().query("SELECT min(range_m) FROM sensor_range")`.
 
     Each topic is a view, such as `sensor_range`. `directory` is `./sessions` by default, or, if there is none, the
-    directory in which the fleet file here records. `on_session` is called for each session that is looked at. `damage`
-    lists the parts that could not be read. Raises FormatMissing without the extra `analysis`, QueryFailed without a
-    directory for temporary files, and OSError if `directory` cannot be listed.
+    directory that `record` names in the fleet file here. `on_session` is called for each session that is looked at.
+    `damage` lists the parts that could not be read. Raises FormatMissing without the extra `analysis`, QueryFailed
+    without a directory for temporary files, and OSError if `directory` cannot be listed.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Catalog:
         return import_pyarrow().table({}) if answer is None else answer.to_arrow_table()
 
     def left_out(self) -> dict[str, LeftOut]:
-        """Return the messages of each session that no view has: not decodable, or not of the type of their key.
+        """Say which messages of each session are in no view, because they cannot be decoded or have another type.
 
         Only topics for which a question has asked so far are counted.
         """

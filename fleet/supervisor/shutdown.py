@@ -12,8 +12,8 @@ from fleet.client.claims import (
     NOT_STOPPED,
     STOP_SENT,
     STOPPED,
+    describe_stop,
     may_still_move,
-    rest_words,
 )
 from fleet.supervisor.car_status import CarStatus
 from fleet.supervisor.process_state import GATEWAY_GRACE_S, WRONG_USE, delay_s
@@ -144,7 +144,7 @@ class GatewayShutdown:
         """
         row = self._rows.get(process.name)
         if row is not None and row.motors.what == Motors.OFF:
-            self._finish(process, rest_words(row.motors, process.name))
+            self._finish(process, describe_stop(row.motors, process.name))
         elif self._processes.now >= self._unclaimed[process.name]:
             self._finish(process, STOP_SENT)
 

@@ -20,4 +20,4 @@ class HubUnreachable(NoFleet):
 
 
 class BadEndpoint(BusError):
-    """An endpoint that is invalid for Zenoh, or at which no hub may listen."""
+    """An endpoint that is invalid for Zenoh, or at which a hub is not allowed to listen."""

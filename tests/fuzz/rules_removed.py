@@ -23,7 +23,7 @@ def _time_decides(patch: Patch) -> None:
         if now >= running.obeys_by:
             self._finish(running, Basis.SHOWN, "time", now)
 
-    patch(StopExecutor, "_await_evidence", await_time)
+    patch(StopExecutor, "_check_evidence", await_time)
 
 
 def _no_second_try(patch: Patch) -> None:
@@ -95,7 +95,7 @@ def _sent_without_a_report(patch: Patch) -> None:
     def ends(self: StopExecutor, running: StopInProgress, now: float) -> StopCase | None:
         return cases.NO_ECHO if running.frames_sent and now >= running.obeys_by else None
 
-    patch(StopExecutor, "_ends_as_sent", ends)
+    patch(StopExecutor, "_case_that_ends", ends)
 
 
 def _a_stop_that_is_driven_over_ends_without_a_word(patch: Patch) -> None:

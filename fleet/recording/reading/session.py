@@ -82,8 +82,8 @@ class Session:
     """A recorded session: `Session("latest").to_pandas("sensor/range")`.
 
     `path` is the directory of a session, an .mcap file, the name of a session, or `latest` (`latest~1` is the one
-    before). Names are looked up in `./sessions`, or where the fleet file in the current directory records. Raises
-    NoSession. Reading never changes a session. `damage_words` describes the damage that was found.
+    before). Names are looked up in `./sessions`, or in the directory that `record` names in the fleet file here.
+    Raises NoSession. A session is never changed by reading it. `damage_words` describes the damage that was found.
     """
 
     def __init__(self, path: str | PathLike[str] = LATEST) -> None:
@@ -263,16 +263,16 @@ class Session:
         *,
         decode: bool = False,
     ) -> Iterator[Recorded] | Iterator[Reading]:
-        """Yield every intact message in the order of the file. `damage_words` then describes the damage.
+        """Yield every intact message in the order of the file. Afterwards, `damage_words` describes the damage.
 
-        `keys` selects one or several topics (`sensor/range`, `sensor/*`), messages (`fleet.v1.Range`), keys or key
-        expressions (`red/sensor/range`, `fleet/red/**`). `start_ns` (included) and `end_ns` (excluded) are times of the
-        recorder's clock, ns since the epoch. If the files have an index, only the parts with these times are read. So
-        reading the last minute of a long session takes hardly longer than reading a session of one minute.
-        With `decode`, yield readings, as `Fleet.watch` does; messages that cannot be decoded are counted in `left_out`.
-        Without it, yield payloads as they were on the bus.
-        Raises NoTable if `keys` is a single name without wildcards that is no known topic, message or command, and the
-        indexes of all files show that the session has no such messages. Without an index, it yields nothing.
+        `keys` selects one or several topics (`sensor/range`, `sensor/*`), message types (`fleet.v1.Range`), keys or
+        key expressions (`red/sensor/range`, `fleet/red/**`). `start_ns` (included) and `end_ns` (excluded) are times of
+        the recorder's clock, ns since the epoch. If the files have an index, only the parts with these times are read.
+        So reading the last minute of a long session takes hardly longer than reading a session of one minute. With
+        `decode`, yield readings, as `Fleet.watch` does; messages that cannot be decoded are counted in `left_out`.
+        Without it, yield payloads as they were on the bus. Raises NoTable if `keys` is one name without wildcards that
+        is neither known nor in the session. That takes the indexes of all files. If a file has none, nothing is yielded
+        instead.
         """
         selection = self.selection(keys, start_ns, end_ns)
         if isinstance(keys, str) and not is_known(keys) and self._lacks(selection):
@@ -305,9 +305,9 @@ class Session:
         fields. The times have the type timestamp[ns, UTC]. The unit of a field is in the column's name and in the
         field's metadata (`unit`). A value that was not measured is null. For commands, each field of the request has a
         column (`request_motion`). Messages of another type under these keys are left out; a warning counts them, and
-        `stray_tables` has them. So are messages that do not match their schema, but no table has them. Times beyond the
-        year 2262 are null, with a warning. Raises NoTable, and FormatMissing (an ImportError) without the extra
-        `analysis`.
+        `stray_tables` has them. Messages that do not match their schema are left out and counted, too, and no table has
+        them. Times beyond the year 2262 are null, with a warning. Raises NoTable, and FormatMissing (an ImportError)
+        without the extra `analysis`.
         """
         return arrow_table(self.rows(self.selection(of, start_ns, end_ns)), of, self.name)
 
@@ -327,15 +327,15 @@ class Session:
         return data_frame(self.to_arrow(of, start_ns=start_ns, end_ns=end_ns))
 
     def joined(self, of: str, *others: str, tolerance_s: float | None = None) -> "pd.DataFrame":
-        """Return the table of the first topic, with the latest values that the same car had published in the others.
+        """Return the table of `of`. Each row also has what the same car had last published in `others` by then.
 
         `session.joined("sensor/range", "state/mode")` adds the columns `mode.asked`, `mode.verdict`, ... to those of
-        the distances. They are null in rows for which there is no value, or only one that is too old. `tolerance_s` is
-        the maximum age, s, by publish_time. The default is the time after which the topic is stale (3 s for readings
-        and states); topics that are never stale have no limit. With `state/mode` there are two more columns: `mode` is
-        the commanded mode, and `mode_seen` the mode that the car's readings show. They are null if not known. A warning
-        says how long cars were in modes in which this reading does not exist: see `times_without`. Raises the errors of
-        `to_pandas`, and ValueError for a negative `tolerance_s`.
+        `sensor/range`. The added columns are null in rows for which there is no value, or only one that is too old.
+        `tolerance_s` is the maximum age, s, by publish_time. The default is the time after which the other topic is
+        stale (3 s for readings and states); topics that are never stale have no limit. With `state/mode` there are two
+        more columns: `mode` is the commanded mode, and `mode_seen` the mode that the car's readings show. They are null
+        if not known. A warning says how long cars were in modes in which this reading does not exist: see
+        `times_without`. Raises the errors of `to_pandas`, and ValueError for a negative `tolerance_s`.
         """
         if tolerance_s is not None and not tolerance_s >= 0:
             raise ValueError(f"tolerance_s {tolerance_s:g} is not allowed: at least 0, or None for the topic's own")
@@ -352,7 +352,7 @@ class Session:
 
         For example, a car sends no distances in obstacle avoidance. If a plot marks these times, it shows why there are
         no points. `of` is as for `to_pandas`, but about one sensor (`sensor/range`, `red/sensor/range`). The mode is
-        the commanded one, or the one that the car's readings show if they contradict it. Manual mode has all readings.
+        the commanded one or, if the car's readings contradict it, the one that they show. Manual mode has all readings.
         Raises NoTable for another name, and FormatMissing without the extra `analysis`.
         """
         if not sensor_of(of):

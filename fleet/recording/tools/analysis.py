@@ -28,7 +28,7 @@ _NOT_JOINED: Final = frozenset({"key", "car", "log_time", "sequence", "seq", "bo
 
 
 class NoTable(ValueError):
-    """A name that selects nothing, or several tables. The text has likely names if there are any."""
+    """A name that selects nothing, or more than one table. The text has likely names if there are any."""
 
 
 def arrow_table(rows: Iterable[Row], of: str, session: str) -> "pa.Table":

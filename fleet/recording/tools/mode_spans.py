@@ -54,7 +54,7 @@ def _is_measurable(sensor: str, mode: Mode) -> bool:
 def mode_spans(states: Iterable[Mapping[str, Any]]) -> Iterator[ModeSpan]:
     """Yield the spans of each car, from rows of `state/mode` sorted by publish_time.
 
-    The mode is the commanded one, or the one that the car's readings show if they contradict it. Unknown modes have no
+    The mode is the commanded one or, if the car's readings contradict it, the one that they show. Unknown modes have no
     span.
     """
     current: dict[str, ModeSpan] = {}

@@ -30,11 +30,11 @@ class SessionCheckup(Struct):
     """Counts of one session."""
 
     stops: Counter[str] = field(default_factory=Counter)
-    """Ended stops by `shown`, `sent` or `failed`."""
+    """How many stops ended as `shown`, `sent` and `failed`."""
     unshown: StopFindings = field(default_factory=StopFindings)
     """Stops that a car did not show, or that did not stop it."""
     refused: Counter[str] = field(default_factory=Counter)
-    """Refused and failed commands by reason, without stops."""
+    """Refused and failed commands by reason, except stops."""
     broken: Counter[str] = field(default_factory=Counter)
     """Lost links by car."""
     car: str = ""
@@ -44,7 +44,7 @@ class SessionCheckup(Struct):
     _clock: RecorderClock = field(default_factory=RecorderClock)
 
     def watch(self, rows: Iterable[Row]) -> Iterator[Row]:
-        """Pass rows on, and count them."""
+        """Pass all rows on, and count what matters in them."""
         for row in rows:
             key = keys.parse(row[0].channel.topic)
             if key is not None and not key.car.startswith("@"):
@@ -87,24 +87,25 @@ class SessionCheckup(Struct):
             )
         if verdict.missing_count:
             worst = max(verdict.missing, key=lambda gap: gap["count"])
-            words = f"{verdict.missing_count} messages are missing, most at once of {worst['key']} ({worst['count']})."
+            words = f"{verdict.missing_count} messages are missing. Largest gap: {worst['count']} of {worst['key']}."
             yield DoctorFinding("gaps", words, verify)
         elif missed := sum(verdict.missed.values()):
-            words = f"{missed} messages never came, most of {max(verdict.missed, key=verdict.missed.__getitem__)}."
+            worst_key = max(verdict.missed, key=verdict.missed.__getitem__)
+            words = f"By the recorder's count, {missed} messages never came, most of them of {worst_key}."
             yield DoctorFinding("gaps", words, verify)
-        if cars := _most(self.broken):
+        if cars := _describe(self.broken):
             yield DoctorFinding("link_breaks", f"Links broke: {cars}.", replay)
-        if reasons := _most(self.refused):
+        if reasons := _describe(self.refused):
             yield DoctorFinding("refused", f"Commands were refused or failed: {reasons}.", replay)
 
     def facts(self, verdict: SessionVerdict) -> Iterator[tuple[str, str]]:
         """Yield the facts known about the session, as names and texts."""
         yield "state", f"{'whole' if verdict.whole else 'not whole'}, {verdict.messages} messages"
         lost = sum(verdict.dropped.values()) + sum(verdict.missed.values())
-        yield "lost", f"{verdict.missing_count} missing by number, {lost} by the recorder's count"
+        yield "lost", f"{verdict.missing_count} by their sequence numbers, {lost} by the recorder's count"
         yield "stops", ", ".join(f"{self.stops[basis]} {basis}" for basis in (*Basis, Phase.FAILED))
-        yield "refused", _most(self.refused) or "none"
-        yield "links lost", _most(self.broken) or "none"
+        yield "refused", _describe(self.refused) or "none"
+        yield "links lost", _describe(self.broken) or "none"
         steps = len(verdict.backwards) + sum(each.backwards for each in verdict.clocks.values())
         yield "clock steps", str(steps)
 
@@ -115,5 +116,5 @@ class SessionCheckup(Struct):
         return {"session": verdict.session, "findings": found, "facts": dict(self.facts(verdict)), "stops": stops}
 
 
-def _most(counts: Counter[str]) -> str:
+def _describe(counts: Counter[str]) -> str:
     return ", ".join(f"{name} {count}" for name, count in counts.most_common() if count)

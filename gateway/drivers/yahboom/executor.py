@@ -118,7 +118,7 @@ class Executor(Driver):
         self.expire(now)
         stops = self.stops
         running = stops.running
-        if running is not None and stops.is_shutdown_over(now):
+        if running is not None and stops.is_shutdown_timed_out(now):
             stops.give_up(running, now)
             return None
         if running is not None:

@@ -1,6 +1,6 @@
-"""Carries out the stops of one car: repeats each stop until the car has shown it, or cannot show it. Pure.
+"""Carries out the stops of one car: repeats each until the car has shown it, or it is clear that the car cannot. Pure.
 
-`Executor` writes the frames. `CarMonitor` reports what the car's readings show.
+Two other classes help: `Executor` writes the frames, and `CarMonitor` reports what the car's readings show.
 """
 
 from typing import Final
@@ -23,12 +23,12 @@ from schemas.limits import SHUTDOWN_S
 from schemas.words import Basis, CarTrust, FrameOrigin, Level, Phase, Reason, Shows
 
 _PROBED: Final = (Finding.REPORT, Finding.BLOCK_GAP, Finding.CONTROL)
-"""After one of these findings, the gateway sends a probe or a control, if the car may still show the stop. They are the
-test frames of `sequences`."""
+"""After one of these findings, the gateway sends a test frame of `sequences` (`PROBE`, or `control` after a control),
+if the car may still show the stop."""
 
 
 class StopExecutor:
-    """The stop in progress, if any, and the renewals after it: repeats of a stop that the car has not shown."""
+    """Carries out one stop at a time. After a stop that has ended without being shown, `renewal` repeats it."""
 
     def __init__(self, model: CarModel, log: CommandLog) -> None:
         self.model = model
@@ -36,7 +36,7 @@ class StopExecutor:
         self.renewal = StopRenewal(model)
         self.shutting_down = False
         self.not_stopped = ""
-        """Why the car was not stopped at the end of the gateway. Empty if it was stopped."""
+        """Why the car was not stopped when the gateway ended. Empty if it was stopped."""
         self._log = log
         self._shutdown_until = float("inf")
 
@@ -64,14 +64,15 @@ class StopExecutor:
             running.repeats = False
         if why is FrameOrigin.SHUTDOWN:
             running.why = why
-        # A new command need not wait for the next try. But the car reads the next frame alone only after this silence.
+        # A new command need not wait for the next try, but for this silence: only after it does the car read the next
+        # frame by itself, and not as a part of the last one.
         if pending is not None and running.frames_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._log.record_sent(pending, now, f"joined the running {running.sequence.name} stop")
 
     def leave_open_mode(self, now: float) -> None:
-        """Send `MODE00` to a car whose readings show an open mode, if it has only got general stops until now."""
+        """Begin a recovery, because readings show an open mode. In a shutdown or a stop with `MODE00`, do nothing."""
         running = self.running
         got_mode_frame = running is not None and any(
             isinstance(step.frame, ModeClose) for step in running.sequence.steps
@@ -82,7 +83,7 @@ class StopExecutor:
             )
 
     def recover(self, now: float, words: str) -> None:
-        """Begin to bring the car to a known state. Commands that wait for a running stop then wait for this one."""
+        """Begin to bring the car to a known state. Commands that wait for a running stop then wait for the recovery."""
         before = self.running
         why, commands = (before.why, before.commands) if before is not None else (FrameOrigin.RECOVERY, [])
         self.model.learn(TrustEvent.DOUBTED, now, words)
@@ -147,15 +148,15 @@ class StopExecutor:
 
     @property
     def finished(self) -> bool:
-        """Return True after `shut_down` if the stop is over or was given up: not shown in time, or the link is down."""
+        """Return True after `shut_down` if the stop is over, or was given up because of its time or of a lost link."""
         return self.shutting_down and self.running is None
 
-    def is_shutdown_over(self, now: float) -> bool:
+    def is_shutdown_timed_out(self, now: float) -> bool:
         """Return True if a gateway that shuts down has waited long enough for evidence of the stop."""
         return self.shutting_down and now >= self._shutdown_until
 
     def give_up(self, running: StopInProgress, now: float) -> None:
-        """End the last stop although the car has not shown it, because the gateway must end."""
+        """End the stop of the shutdown although the car has not shown it, because the gateway must end."""
         self.running = None
         self._end_unstopped("has not reacted to the stop", now)
         for pending in running.commands:
@@ -168,9 +169,9 @@ class StopExecutor:
     # ------------------------------------------------------------------ tries
 
     def settle(self, running: StopInProgress, now: float) -> None:
-        """End the stop as shown, if no reading has followed its last block gap too early.
+        """End the stop as shown, if its last block gap has been followed by the silence that confirms it.
 
-        A block gap is an interval between two reports that is longer by just the block of `MODE00`.
+        A block gap is an interval between two reports that exceeds the usual one by exactly the block of `MODE00`.
         """
         if self.model.evidence.settle(now):
             self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
@@ -178,14 +179,14 @@ class StopExecutor:
     def is_step_due(self, running: StopInProgress, now: float) -> bool:
         """Return True if the next frame of the stop is due. After the last frame, check for evidence instead."""
         if running.frames_sent:
-            self._await_evidence(running, now)
+            self._check_evidence(running, now)
             if self.running is not running or running.frames_sent:
                 return False
         return now >= running.due_at(self.model.pacing)
 
-    def _await_evidence(self, running: StopInProgress, now: float) -> None:
-        """End a stop that the car cannot show. Send the stop again if the car could show it, but did not in time."""
-        case = self._ends_as_sent(running, now)
+    def _check_evidence(self, running: StopInProgress, now: float) -> None:
+        """End the stop as sent if the car cannot show it. Send it again if the car can, but did not in time."""
+        case = self._case_that_ends(running, now)
         if case is cases.SOFT and self.model.is_deaf:
             self._doubt_soft(running, now)
             return
@@ -195,7 +196,7 @@ class StopExecutor:
         if self.model.evidence.settles_at is None and now >= running.try_due_at(self.model.pacing):
             self._try_again(running, now)
 
-    def _ends_as_sent(self, running: StopInProgress, now: float) -> StopCase | None:
+    def _case_that_ends(self, running: StopInProgress, now: float) -> StopCase | None:
         """Return the case with which the stop ends as sent. None if it does not end now."""
         if self.model.trust.state is CarTrust.UNHEARD:
             return None
@@ -220,16 +221,18 @@ class StopExecutor:
         )
 
     def _doubt_soft(self, running: StopInProgress, now: float) -> None:
-        """Replace a soft stop by full stops, because the car has not reacted to the last full stop."""
+        """Replace a soft stop by a full stop, because the car has not shown its last full stop."""
         what = (
-            "and has not reacted to the last stop" if self.model.missed_stop else "before it could show its last stop"
+            "although it had not reacted to the last stop"
+            if self.model.missed_stop
+            else "before it could show its last stop"
         )
-        words = f"{self.model.name} was driven again, {what}"
+        words = f"{self.model.name} was driven again {what}"
         for pending in running.commands:
             self._log.record(pending, Phase.SENT, now, words=words, basis=Basis.SENT)
         self._start(self.full(now), FrameOrigin.RECOVERY, now, [])
         assert self.running is not None
-        self.running.overdue = self.running.repeats = True  # so that the next drive need not wait for evidence
+        self.running.overdue = self.running.repeats = True  # such a stop does not hold up the next drive
         self.model.learn(TrustEvent.NOT_SHOWN, now, words)
 
     def _try_again(self, running: StopInProgress, now: float) -> None:
@@ -240,13 +243,13 @@ class StopExecutor:
     def fail_late(self, running: StopInProgress, now: float) -> None:
         """Fail the commands that have waited too long for evidence, and continue the stop.
 
-        But if it is not known whether the reports of the car show stops, end the stop as sent.
+        But if the car has reported since, and it is not known whether its reports can show stops, end the stop as sent.
         """
         if self.model.evidence.settles_at is not None:
             return  # wait for the end of the silence that shows the stop
         car = self.model.name
         is_late = any(now >= pending.received_at + running.timeout_s for pending in running.commands)
-        if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._never_reacted(running):
+        if (is_late or (now >= running.gives_up_at and not running.overdue)) and self._may_be_unable_to_show(running):
             self._finish_unknown(running, now)
             return
         goes_on = f"The gateway keeps stopping it.{self.model.silent_program}"
@@ -271,13 +274,13 @@ class StopExecutor:
                 self.model.learn(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
 
-    def _never_reacted(self, running: StopInProgress) -> bool:
-        """Return True if the car has reported in mode 0 since the stop began, but may be one that cannot show stops."""
+    def _may_be_unable_to_show(self, running: StopInProgress) -> bool:
+        """Return True if the car has reported in mode 0 since the stop began, but it may be unable to show stops."""
         is_unknown = self.model.learned.shows is Shows.UNKNOWN
         return is_unknown and running.report_at > running.began_at and self.model.is_heard
 
     def _finish_unknown(self, running: StopInProgress, now: float) -> None:
-        """End, as sent, the stop of a car of which it is not known whether its reports show stops."""
+        """End the stop as sent, because it is not known whether the reports of this car can show stops."""
         self._finish(running, Basis.SENT, cases.NOT_KNOWN.why(self.model.name), now, cases.NOT_KNOWN)
 
     def end_doubt(self, now: float) -> None:
@@ -287,7 +290,7 @@ class StopExecutor:
             self._finish_unknown(self.running, now)
 
     def give_way(self, now: float) -> None:
-        """End a stop that the car has not shown yet, because a new command replaces its repeats."""
+        """End a stop that the car has not shown yet, because a new command comes instead of its further tries."""
         running, self.running = self.running, None
         words = f"the stop was sent, and {self.model.name} was commanded again before its readings could show it"
         for pending in running.commands if running is not None else ():
@@ -320,13 +323,13 @@ class StopExecutor:
         # Leave the next interval undisturbed, so that the rhythm (the usual interval of the reports) can be learned.
         if finding is Finding.UNJUDGED:
             running.report_wait_s = stop_in_progress.report_wait_s(self.model.profile, self.model.learned, slowest=True)
-            if self.model.learned.echo.is_known:  # the rhythm was known, but it is another one now
+            if self.model.learned.echo.is_known:  # a rhythm was learned, but now it is another one
                 next_s = at - running.last_at + stop_in_progress.SLOWEST_S + stop_in_progress.REPORT_MARGIN_S
                 running.report_wait_s = max(running.report_wait_s, next_s)
         if self.running is running and running.frames_sent:
-            self._await_evidence(running, now)
-        # A probe counts only on a car that is awake, so send it directly after a report. If it cannot be sent now, wait
-        # for the next report.
+            self._check_evidence(running, now)
+        # A probe proves something only if the car is awake, as it is directly after a report. If the probe cannot be
+        # sent now, wait for the next report.
         is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)
         if (
             self.running is running
@@ -351,7 +354,7 @@ class StopExecutor:
             self._try_again(running, now)
 
     def on_sleep(self, now: float) -> None:
-        """Stop the car after a sleep of the computer. Continue an earlier stop, with its next try at once."""
+        """Stop the car after a sleep of the computer. If a stop runs that is not soft, send its next try at once."""
         running = self.running
         if running is not None and running.sequence.rank > sequences.SOFT.rank:
             if running.frames_sent:
@@ -362,8 +365,8 @@ class StopExecutor:
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once, because the reports have continued without a block gap.
 
-        Do so only in the first try, and only if the case of the stop allows it: the reports of a Raspberry Pi always
-        continue.
+        Do so only in the first try, and only if the case of the stop allows it. The case of a Raspberry Pi does not,
+        because its reports always continue.
         """
         running.probes += 1
         if (
@@ -373,9 +376,9 @@ class StopExecutor:
         ):
             self._try_again(running, now)
             if running.sequence.is_recovery:
-                # The car may report by a timer although frames block it. Then the block of the last frame may not be
-                # over. If a `#` arrived before the end of the block, the car would read it and the `MODE00` after it as
-                # one string.
+                # A report does not prove that the block of the last frame is over: some cars report by a timer, also
+                # during a block. A `#` that arrives during the block would be read as one string with the `MODE00`
+                # after it.
                 running.try_at = max(now, self.model.pacing.flight_until + FLIGHT_S)
 
     def _finish(

@@ -5,11 +5,11 @@ import pytest
 from fleet.client.car_state import LATE_MESSAGE_NS, GatewayStarts
 from fleet.client.claims import (
     CarClaim,
+    describe_stop,
     link_claim,
     may_still_move,
     mode_claim,
     motors_claim,
-    rest_words,
 )
 from schemas.gen import fleet_v1_pb2 as pb
 
@@ -56,7 +56,7 @@ def test_without_a_gateway_nothing_is_claimed_but_what_was() -> None:
     ],
 )
 def test_stopped_is_said_only_of_what_was_shown(claim: CarClaim, begins: str, bad: bool) -> None:
-    words = rest_words(claim, "red")
+    words = describe_stop(claim, "red")
     assert words.startswith(begins)
     assert may_still_move(words) is bad
 

@@ -217,7 +217,7 @@ def test_longest_silent_car_is_evicted_never_a_heard_one() -> None:
     assert "junk0" not in view.names
 
 
-def test_listed_car_always_has_place() -> None:
+def test_listed_car_is_always_shown() -> None:
     view = view_of()
     invent(view, MAX_OTHER_CARS, 1.0)
     view.list_cars(["red", "black", "not a name"])
@@ -226,7 +226,7 @@ def test_listed_car_always_has_place() -> None:
     invent(view, MAX_OTHER_CARS, later, "more")
     assert {"red", "black"} < set(view.names), "they are silent, and somebody looks for them"
     assert len(view.names) == MAX_OTHER_CARS + 2
-    assert [view.has_place(name) for name in ("black", "more0", "ghost")] == [True, True, False]
+    assert [view.may_show(name) for name in ("black", "more0", "ghost")] == [True, True, False]
     # Whoever says what the fleet lists, and says it again and again, gains no more.
     for number in range(10):
         names = [f"list{number}_{each}" for each in range(2 * MAX_LISTED_CARS)]

@@ -27,7 +27,7 @@ unless a name says otherwise. A value that was not measured is None.
 from fleet import Fleet, LeaseLost, NotCarriedOut, Session
 ```
 
-`from fleet.aio import Fleet` has the same names for asyncio; there you await each call.
+`from fleet.aio import Fleet` has the same names for asyncio; there you await the calls that the last section lists.
 The guide "Drive from Python" has examples. The glossary explains words such as lease and hold.
 """
 _CLASSES: tuple[tuple[str, type], ...] = (
