@@ -15,12 +15,17 @@ from typing import Any, Final
 
 from msgspec.structs import replace
 
+from fleet.policy.debounce import HYSTERESIS_S
 from fleet.policy.decide import step
+from fleet.policy.decision import DecisionKind
 from fleet.policy.plan.plan import Plan
 from fleet.policy.plan.plan_parser import parse
 from fleet.policy.role_allocation import REFUSED_MODE_RETRY_S
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
 from fleet.policy.state import PolicyState, on_hub_back, restore, to_persisted
+from schemas.gen import fleet_v1_pb2 as pb
+from schemas.messages import Observation
+from schemas.topics import TOPICS
 from schemas.words import UNKNOWN, LinkState, Mode, Motors, Reason, Verdict
 
 TICK_S: Final = 0.25
@@ -32,6 +37,7 @@ WALL_S: Final = 1_000.0
 """Difference of the wall clock to the virtual time."""
 MAX_COMMANDS: Final = 8
 """Maximum number of mode commands to a car within 30 s in which nothing happens to any car."""
+STALE_S: Final = TOPICS["sensor/light"].stale_after_s or 0.0
 LASTS_S: Final = 30.0
 """Time in its mode after which earlier failures of a car are forgotten."""
 PLANS: Final = tuple(
@@ -44,6 +50,10 @@ PLANS: Final = tuple(
         """
 fixed: {green: {mode: following}}
 roles: {two: {mode: tracking, count: 2, if_none: one}, one: {mode: following}}
+""",
+        """
+roles: {pair: {mode: tracking, count: 2}}
+rules: [{when: {car: red, is: light.left, for_s: 0.5}, then: {who: blue, mode: following}}]
 """,
     )
 )
@@ -75,7 +85,13 @@ class PolicyCar:
     happened_at: float = float("-inf")
     """When something last happened to the car."""
     asked: list[tuple[float, str]] = field(default_factory=list)
-    in_mode_since: float | None = None
+    is_lit: bool = False
+    light: Observation | None = None
+    """The last reading of the light."""
+    told_since: float = 0.0
+    """Since when each reading has had this value, and none was late."""
+    free_since: float = 0.0
+    """Since when the plan may command the car."""
 
     @property
     def gone(self) -> bool:
@@ -109,10 +125,11 @@ class PolicyEpisode:
         self._running = 0
         """Number of the coordinator. Outcomes of commands of an earlier one reach nobody."""
         self._hub_away = False
-        self._happened_at = 0.0
+        self._happened_at = self._new_at = 0.0
         self._calm_commands: dict[str, list[float]] = defaultdict(list)
         for car in self.cars.values():
             self._later(moments.uniform(0.0, 1.0), self._appear, car)
+            self._later(moments.uniform(0.0, 1.0), self._report, car)
 
     def _draw(self, name: str) -> PolicyCar:
         moments = self.moments
@@ -155,6 +172,7 @@ class PolicyEpisode:
         result = step(self.plan, snapshot, self.memory, self.now)
         self.memory = result.memory
         self._judge_switches(before, self.memory.roles)
+        self._judge_rule()
         for command in result.commands:
             if command.mode is None:
                 continue
@@ -169,9 +187,8 @@ class PolicyEpisode:
             self._later(self.moments.uniform(0.001, 0.02), self._accept, car, str(command.mode), self._running)
 
     def _snapshot(self) -> FleetSnapshot:
-        return FleetSnapshot(
-            {car.name: car.seen for car in self.cars.values() if car.seen.present or car.seen.mode}, {}
-        )
+        readings = {name: {"sensor/light": car.light} for name, car in self.cars.items() if car.light is not None}
+        return FleetSnapshot({name: car.seen for name, car in self.cars.items()}, readings)
 
     # ------------------------------------------------------------------ a gateway
 
@@ -243,6 +260,15 @@ class PolicyEpisode:
             refusal = None if reason is None else Refusal(mode, reason, "", self.now)
             car.seen = replace(car.seen.with_outcome(mode, refusal), busy=False)
 
+    def _report(self, car: PolicyCar) -> None:
+        """Publish a reading of the light, each second."""
+        if not car.gone and not self._hub_away:
+            is_late = car.light is None or self.now - car.light.at > STALE_S - TICK_S
+            if is_late or car.light.message.left != car.is_lit:
+                car.told_since = self.now
+            car.light = Observation(pb.Light(left=car.is_lit, right=False), self.now)
+        self._later(1.0, self._report, car)
+
     # ------------------------------------------------------------------ what happens
 
     def _strike(self) -> None:
@@ -250,7 +276,7 @@ class PolicyEpisode:
         car = self.moments.choice(list(self.cars.values()))
         what = self.moments.choice(
             (self._reset, self._reset, self._drop_link, self._kill, self._empty, self._hold, self._drive, self._restart,
-             self._lose_hub)
+             self._lose_hub, self._switch_lamp, self._switch_lamp)
         )  # fmt: skip
         car.happened_at = self.now
         what(car)
@@ -317,10 +343,14 @@ class PolicyEpisode:
         self._set(car, held_by=None, driven_by=None)
         self._happen(car)
 
+    def _switch_lamp(self, _: PolicyCar) -> None:
+        self.cars["red"].is_lit = not self.cars["red"].is_lit
+
     def _restart(self, _: PolicyCar) -> None:
         """Kill the coordinator. The next one knows what the last one has saved."""
         saved = to_persisted(self.plan, self.memory, self.now, self.now + WALL_S)
         self._running += 1
+        self._new_at = self.now
         for car in self.cars.values():
             car.seen = replace(car.seen, busy=False, refused=None, refused_before=())
         self.memory = restore(self.plan, self._snapshot(), saved, self.now, self.now + WALL_S)
@@ -334,7 +364,7 @@ class PolicyEpisode:
 
     def _return_hub(self) -> None:
         self._hub_away = False
-        self._happened_at = self.now
+        self._new_at = self._happened_at = self.now
         self.memory = on_hub_back(self.memory, self.now)
         for car in self.cars.values():
             if car.seen.present:
@@ -371,6 +401,27 @@ class PolicyEpisode:
                 words = f"{name} loses {role} although it is {car.mode} (asked at {failed})"
                 self.faults.append(f"{self.now:.2f}: {words}: {self.memory.decisions.get(name)}")
 
+    def _judge_rule(self) -> None:
+        """Find a rule that is not in force though its condition is true, or is in force though it has been false."""
+        red, blue = self.cars["red"], self.cars["blue"]
+        decision = self.memory.decisions.get("blue")
+        if decision is None or decision.kind is DecisionKind.ALONE:
+            blue.free_since = self.now
+        if not self.plan.rules or red.light is None or self.now - red.light.at > STALE_S - TICK_S:
+            return
+        known_s = self.now - max(red.told_since, self._new_at)
+        is_on = self._is_by_rule(blue)
+        lasts = known_s > 0.5 + 2 * TICK_S and self.now > blue.free_since
+        if (red.light.message.left and lasts and not is_on) or (
+            not red.light.message.left and known_s > HYSTERESIS_S + 2 * TICK_S and is_on
+        ):
+            self.faults.append(f"{self.now:.2f}: {known_s:.2f} s {red.light.message.left}, but {decision}")
+
+    def _is_by_rule(self, car: PolicyCar) -> bool:
+        """Return True if a rule decides about the car. A role is kept for it meanwhile."""
+        decision = self.memory.decisions.get(car.name)
+        return decision is not None and decision.kind is DecisionKind.RULE
+
     def _judge_rate(self, car: PolicyCar) -> None:
         if self.now - self._happened_at < LASTS_S:
             self._calm_commands.clear()
@@ -384,15 +435,15 @@ class PolicyEpisode:
         """Find a place that is empty after a calm time though a car is free, and a car that is not in its mode."""
         able = [car for car in self.cars.values() if car.able]
         for car in able:
-            held = self.memory.roles.get(car.name)
-            if held is not None and car.mode != self.plan.roles[held].mode:
-                self.faults.append(f"at the end {car.name} has {held}, and is in {car.mode}: {car.seen}")
+            decision = self.memory.decisions.get(car.name)
+            if decision is not None and decision.mode is not None and car.mode != decision.mode:
+                self.faults.append(f"at the end {car.name} is in {car.mode}: {decision} {car.seen}")
         for name, role in self.plan.roles.items():
             if role.count is None or any(other.if_none == name for other in self.plan.roles.values()):
                 continue
             holders = [self.cars[car] for car, held in self.memory.roles.items() if held == name]
             spare = [car.name for car in able if car.name not in self.memory.roles and self.plan.may(car.name, role)]
-            missing = role.count - sum(car.able for car in holders)
+            missing = role.count - sum(car.able or self._is_by_rule(car) for car in holders)
             if missing > 0 and spare:
                 self.faults.append(f"at the end {name} lacks {missing}, but {spare} have no role")
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from fleet.policy import state
+from fleet.policy import debounce, state
 from fleet.policy.state import ModeAttempts
 from tests.fuzz.policy_search import play
 
@@ -21,8 +21,13 @@ def test_search_finds_that_a_car_is_replaced_while_it_changes_back(monkeypatch: 
     assert any("loses" in fault for seed in range(EPISODES) for fault in play(seed).faults)
 
 
-def test_search_finds_that_broken_cars_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("seed", [62, 123])
+def test_search_finds_that_broken_cars_take_turns(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In these fleets, two cars ignore a mode, and nothing happens to them at the end."""
     monkeypatch.setattr(state, "FAILED_MODE_KEPT_S", 0.0)
-    # In these two, two cars that ignore modes are in one fleet, and nothing happens to them at the end.
-    assert play(815).faults
-    assert play(842).faults
+    assert play(seed).faults
+
+
+def test_search_finds_that_a_rule_stays_in_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(debounce, "HYSTERESIS_S", 4.0)
+    assert play(19).faults
