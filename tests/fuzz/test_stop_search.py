@@ -114,6 +114,13 @@ FOUND = (
         opening=True, early=True, stream_s=0.2,
         traits=CarTraits(interval_s=1.0, spread_s=0.0, timer=True, close_s=0.0, last_frame_wins=True),
     ),
+    # The stop was lost. A second one began a new try at once, and each action of a stream put off its first frame.
+    EpisodePlan(
+        315075, "arduino", "arduino", "wall", "following", 2.5165440634124256, Ending.STOP,
+        (LinkFault(Kind.DEAD, Way.TO_CAR, -0.15949700925915766, 2.7122743561884555),),
+        again_s=4.527784239525141, driven=True, stream_s=0.11370913327476209,
+        traits=CarTraits(interval_s=1.493, spread_s=0.0, close_s=0.0, silent_modes=frozenset({Mode.LIGHT_SEEKING})),
+    ),
 )  # fmt: skip
 
 

@@ -66,9 +66,11 @@ class StopInProgress(Struct):
     why: FrameOrigin
     began_at: float
     try_at: float
-    """When the current try began."""
+    """When the current try begins. Frames of other commands put it off."""
     commands: list[Pending] = field(default_factory=list)
     index: int = 0
+    try_decided_at: float = float("-inf")
+    """When the current try was decided on."""
     first_at: float | None = None
     """When the first frame of the stop was written."""
     last_at: float = float("-inf")
@@ -155,7 +157,8 @@ class StopInProgress(Struct):
             return self.next_try_at
         if self.tries > 1 and self.index > 0:
             return float("-inf")  # in a recovery, the car must read nothing else before the lone `MODE00`
-        began = self.try_at if self.index == 0 else self.last_at
+        # Not from `try_at`, which each frame of the stream puts off.
+        began = max(self.began_at, self.try_decided_at) if self.index == 0 else self.last_at
         return began + self.sequence.steps[self.index].after_s + HELD_UP_S
 
     @property
@@ -213,3 +216,4 @@ class StopInProgress(Struct):
     def begin_try(self, sequence: StopSequence, now: float) -> None:
         """Begin the next try."""
         self.sequence, self.index, self.try_at = sequence, 0, now
+        self.try_decided_at = now
