@@ -7,6 +7,7 @@ from msgspec import Struct
 
 from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.session_lookup import newest_first
 from fleet.recording.time_spec import iso_ns
 from schemas.topics import CACHE_S
 
@@ -68,17 +69,25 @@ def _started_ns(session: Session) -> int:
 
 def _find_latest(root: Path, fleet: str, now_ns: int) -> Session | None:
     """Return the latest session if its recorder ended a moment ago without closing it. Otherwise return None."""
-    paths = sorted(root.glob(f"*/{session_dir.SESSION_FILE}"), key=lambda path: path.parent.name)
-    for path in reversed(paths):
-        description = session_dir.SessionInfo.read(path.parent)
-        if description is None or description.fleet != fleet:
+    # The latest by its start, not by its name: a user may have renamed a session, or cut a part of one and kept it
+    # here. A session of the future was recorded with a wrong clock, and says nothing about the time before this one.
+    for path in newest_first(root):
+        description = session_dir.SessionInfo.read(path)
+        if description is None or description.fleet != fleet or _starts_after(description, now_ns):
             continue
         if description.closed or description.ended is not None:
             return None
         try:
-            session = Session(path.parent)
+            session = Session(path)
             written_ns = session.segments[-1].stat().st_mtime_ns
         except (NoSession, OSError):
             return None
         return session if now_ns - written_ns < CACHE_S * 2e9 else None
     return None
+
+
+def _starts_after(description: session_dir.SessionInfo, now_ns: int) -> bool:
+    try:
+        return iso_ns(description.started) > now_ns
+    except (ValueError, OverflowError):  # edited by hand
+        return True

@@ -2,16 +2,22 @@
 
 import json
 import os
+import time
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from fleet.quota import Quota
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
+from fleet.recording.selection import EVERYTHING
 from fleet.recording.session_dir import SessionInfo
+from fleet.recording.time_spec import format_utc
+from fleet.recording.tools.merge_cut_recover import cut
 from fleet.recording.tools.summary import SessionState, of_session
 from fleet.recording.tools.verify import verify
 from fleet.recording.writing.disk_space import MB
@@ -247,6 +253,31 @@ def test_next_session_notices_what_is_lost_between_two(tmp_path: Path) -> None:
     after.close(BEGUN_NS + 9 * SECOND_NS)
     assert (numbers(tape.path), numbers(after.path)) == ([1, 3], [6, 2, 4, 5])
     assert after.description.continues == tape.path.name
+
+
+@pytest.mark.parametrize("other", ["cut", "renamed", "of the future", "without a time"])
+def test_interrupted_session_is_continued_whatever_lies_beside_it(tmp_path: Path, other: str) -> None:
+    """One `fleet sessions cut --out sessions/part`, and no recorder ever continued an interrupted session again."""
+    now_ns = time.time_ns()
+    closed = SessionWriter(tmp_path, "fleet", Options(), now_ns - 60 * SECOND_NS)
+    feed(closed, now_ns - 60 * SECOND_NS)
+    closed.close(now_ns - 59 * SECOND_NS)
+    info = SessionInfo.read(closed.path)
+    assert info is not None
+    if other == "cut":
+        cut(Session(closed.path), tmp_path / "part", EVERYTHING)
+    elif other == "of the future":
+        replace(info, started=format_utc(datetime(2099, 1, 1, tzinfo=UTC))).write(closed.path)
+    elif other == "without a time":
+        replace(info, started="yesterday").write(closed.path)
+    closed.path.rename(tmp_path / "zoo")
+    killed = SessionWriter(tmp_path, "fleet", Options(), now_ns - SECOND_NS)
+    feed(killed, now_ns - SECOND_NS)
+    killed.tick(now_ns)
+    after = SessionWriter(tmp_path, "fleet", Options(), now_ns)
+    for tape in (killed, after):
+        tape.close(now_ns)
+    assert after.description.continues == killed.path.name
 
 
 def test_message_of_a_slow_clock_closes_its_gap(tmp_path: Path) -> None:
