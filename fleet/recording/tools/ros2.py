@@ -1,10 +1,11 @@
 """Writes a session as a ROS 2 bag with standard messages only, which every ROS 2 tool can read. Needs rosbags.
 
 A topic is `/<car>/<topic>`, as in `/red/range`. If ROS has a standard message for a reading, that message is used, with
-ROS's units and its value for "not measured". Everything else becomes a DiagnosticArray with all fields as text, so no
-message of the fleet is lost. Stamps are by the gateway's clock, the times of the bag by the recorder's clock. Frames
-are `<car>/<topic>`, as in `red/range`, except for poses: a measured one has the frame that it names, a true one has
-`world`. There are no transforms, because nobody has measured where the sensors sit on the cars.
+ROS's units and its value for "not measured". Everything else, also a reading with a number that this message cannot
+hold, becomes a DiagnosticArray with all fields as text, so no message of the fleet is lost. Stamps are by the gateway's
+clock, the times of the bag by the recorder's clock. Frames are `<car>/<topic>`, as in `red/range`, except for poses: a
+measured one has the frame that it names, a true one has `world`. There are no transforms, because nobody has measured
+where the sensors sit on the cars.
 """
 
 import json
@@ -275,19 +276,22 @@ def write_bag(rows: Iterable[Row], out: Path) -> Bag:
             if message is None:
                 bag.left_out.add(key, why_not_decoded(decoder, info))
                 continue
-            kind, converted = _convert(message, key, publish_ns)
-            writer.write(connection_of(key, kind, writer), log_ns, _STORE.serialize_cdr(converted, kind))
+            kind, cdr = _convert(message, key, publish_ns)
+            writer.write(connection_of(key, kind, writer), log_ns, cdr)
             bag.messages += 1
     return bag
 
 
 def _convert(message: Message, key: str, publish_ns: int) -> tuple[str, Any]:
-    """Return the ROS type and the converted message."""
+    """Return the ROS type and the serialized message."""
     header = _ros("std_msgs/msg/Header", stamp=_stamp(message_time_ns(message, publish_ns)), frame_id=_frame(key))
     kind, convert = _CONVERTERS.get(message.DESCRIPTOR.full_name, (DIAGNOSTICS, None))
-    if convert is None:
-        return DIAGNOSTICS, _diagnostics(message, header, key)
-    return kind, convert(message, header)
+    if convert is not None:
+        try:
+            return kind, _STORE.serialize_cdr(convert(message, header), kind)
+        except (ValueError, OverflowError):
+            pass  # any program can publish a number that ROS's message cannot hold, such as an infinite angle
+    return DIAGNOSTICS, _STORE.serialize_cdr(_diagnostics(message, header, key), DIAGNOSTICS)
 
 
 @cache

@@ -42,6 +42,9 @@ _WALL_COLOR: Final = (150, 155, 165)
 _TAPE_COLOR: Final = (220, 220, 220)
 MAX_NS: Final = 2**63
 """Times in Rerun are smaller than this."""
+MAX_NUMBER: Final = float(np.finfo(np.float32).max)
+"""Rerun draws places and sizes as float32. What has a larger number, or one that is not finite, has no place: any
+program can publish it."""
 _Times = dict[str, Any]
 _MAX_LEDS: Final = 256
 """Maximum number of LED colors that tracks can show, and of LED commands that await their outcome."""
@@ -185,13 +188,18 @@ class Drawing:
         return parts[0]
 
     def _pose(self, path: str, poses: Any, times: _Times) -> Iterator[Any]:  # noqa: ARG002 - a lens draws the arrow
-        points = np.stack([numbers(poses, "x_m"), numbers(poses, "y_m")], axis=1)
-        self._parts.setdefault(panels.key_of(path), []).append(points)
+        self._extend_path(path, numbers(poses, "x_m"), numbers(poses, "y_m"))
         return iter(())
+
+    def _extend_path(self, path: str, x: Any, y: Any) -> None:
+        points = np.stack([x, y], axis=1)
+        placed = points[(np.abs(points) <= MAX_NUMBER).all(axis=1)]
+        if len(placed):
+            self._parts.setdefault(panels.key_of(path), []).append(placed)
 
     def _truth(self, path: str, truths: Any, times: _Times) -> Iterator[Any]:
         x, y, leds = numbers(truths, "x_m"), numbers(truths, "y_m"), truths.field(_LED).dictionary_encode()
-        self._parts.setdefault(panels.key_of(path), []).append(np.stack([x, y], axis=1))
+        self._extend_path(path, x, y)
         seen = leds.dictionary.to_pylist()
         self._add_leds(seen)
         tints = _tints(rgb(each) for each in seen)[leds.indices.to_numpy(zero_copy_only=False)]
@@ -205,7 +213,7 @@ class Drawing:
     def _world(self, path: str, worlds: Any, times: _Times) -> Iterator[Any]:
         rows = worlds.to_pylist()
         yield from self._static_world(path, rows[-1])
-        lamps = [row["lamps"] or [] for row in rows]
+        lamps = [_placed(row["lamps"]) for row in rows]
         if any(lamps):
             every = [lamp for row in lamps for lamp in row]
             points = rr.Points3D.columns(
@@ -216,7 +224,7 @@ class Drawing:
             )
             points = points.partition([len(row) for row in lamps])
             yield rrc.Chunk.from_columns(f"{path}/lamps", indexes=_indexes(times), columns=points)
-        things = [row["things"] or [] for row in rows]
+        things = [_placed(row["things"]) for row in rows]
         if any(things):
             every = [thing for row in things for thing in row]
             boxes = rr.Boxes3D.columns(
@@ -231,8 +239,9 @@ class Drawing:
 
     def _static_world(self, path: str, world: Any) -> Iterator[Any]:
         """Yield the walls and the taped line once, and again if they change."""
-        walls = [[_point(wall["begin"]), _point(wall["end"])] for wall in world["walls"] or ()]
-        line = [_point(each) for each in world["line"] or ()]
+        ends = [_placed([wall["begin"], wall["end"]]) for wall in world["walls"] or ()]
+        walls = [[_point(begin), _point(end)] for begin, end in (each for each in ends if len(each) == 2)]
+        line = [_point(each) for each in _placed(world["line"])]
         strips = {
             "walls": (walls, _WALL_COLOR, 0.03),
             "line": ([[*line, line[0]]] if line else [], _TAPE_COLOR, 0.0125),
@@ -315,6 +324,15 @@ def _led_color(event: dict[str, Any]) -> str:
     return (
         f"#{requested.r:02x}{requested.g:02x}{requested.b:02x}" if requested.r or requested.g or requested.b else "off"
     )
+
+
+def _placed(parts: Iterable[dict[str, Any] | None] | None) -> list[dict[str, Any]]:
+    """Return those parts of a world that are there, and can be drawn."""
+    return [part for part in parts or () if part is not None and all(map(_is_drawable, part.values()))]
+
+
+def _is_drawable(value: Any) -> bool:
+    return not isinstance(value, float) or abs(value) <= MAX_NUMBER
 
 
 def _point(point: dict[str, float]) -> tuple[float, float, float]:

@@ -79,8 +79,9 @@ def lenses() -> list[Any]:
 
 
 def triples(x: Any, y: Any) -> Any:
-    """Return points on the ground, one row of float32 each."""
-    return np.stack([x, y, np.zeros(len(x))], axis=1).astype("float32")
+    """Return points on the ground, one row of float32 each. A number that is too large for that becomes infinite."""
+    with np.errstate(over="ignore"):
+        return np.stack([x, y, np.zeros(len(x))], axis=1).astype("float32")
 
 
 def numbers(messages: Any, name: str) -> Any:
@@ -166,4 +167,5 @@ def _origins(poses: Any) -> Any:
 
 def _vectors(poses: Any) -> Any:
     heading = numbers(poses, "heading_rad")
-    return _fixed(triples(_ARROW_M * np.cos(heading), _ARROW_M * np.sin(heading)))
+    with np.errstate(invalid="ignore"):  # an infinite heading has no arrow
+        return _fixed(triples(_ARROW_M * np.cos(heading), _ARROW_M * np.sin(heading)))

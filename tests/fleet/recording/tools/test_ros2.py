@@ -101,6 +101,25 @@ def test_ros2_pose_keeps_frame_and_error(tmp_path: Path) -> None:
     assert known == pytest.approx({0: 0.01, 7: 0.01})
 
 
+@pytest.mark.parametrize(
+    ("topic", "name", "fields"),
+    [
+        ("attitude", "fleet.v1.Attitude", {"yaw_rad": math.inf}),
+        ("pose", "fleet.v1.Pose", {"xy_std_m": 1e300}),
+        ("battery", "fleet.v1.Battery", {"voltage_v": 1e300}),
+    ],
+)
+def test_number_that_ros_cannot_hold_is_text(topic: str, name: str, fields: dict[str, Any], tmp_path: Path) -> None:
+    """One such message of any program on the bus ended the export with a traceback."""
+    rows = [(f"fleet/red/sensor/{topic}", name, each) for each in ({}, fields, {})]
+    bag = write_bag(Session(write(tmp_path / "one.mcap", *rows)).rows(), tmp_path / "bag")
+    assert bag.messages == 3
+    ((other, message),) = [(at, each) for at, kind, _, each in read(tmp_path / "bag") if kind == DIAGNOSTICS]
+    assert other == f"/red/{topic}_2"
+    (value,) = [each.value for each in message.status[0].values if each.key in fields]
+    assert float(value.strip('"')) in fields.values()
+
+
 def test_message_without_ros_type_becomes_diagnostic_status(tmp_path: Path) -> None:
     row = ("fleet/red/state/mode", "fleet.v1.Mode", {"car": "red", "asked": "tracking", "candidates": ["a", "b"]})
     write_bag(Session(write(tmp_path / "one.mcap", row)).rows(), tmp_path / "bag")

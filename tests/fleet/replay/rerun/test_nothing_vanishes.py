@@ -1,13 +1,16 @@
 """Every recorded message is shown by `fleet replay`, or named with its key, count and cause."""
 
+import math
 import subprocess
 import sys
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import pytest
+import rerun.chunk as rrc
 from click.testing import CliRunner
 from mcap.writer import IndexType
 
@@ -15,6 +18,7 @@ from fleet.commands.replay import replay
 from fleet.recording.left_out import LeftOutCause
 from fleet.recording.reading.session import NoSession, Session
 from fleet.replay.rerun import rrd_export
+from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.random_session import LINK, LOG, RANGE, UNKNOWN_LEVEL, Mixed, make
 
 
@@ -53,6 +57,39 @@ def test_junk_is_named_by_its_cause(tmp_path: Path) -> None:
         (RANGE, LeftOutCause.NOT_PROTOBUF): 1,
         ("/imu", LeftOutCause.NOT_PROTOBUF): 1,
     }
+
+
+ODD_NUMBERS = (math.inf, -math.inf, math.nan, 1e300)
+
+
+def test_numbers_without_a_place_hide_nothing(tmp_path: Path) -> None:
+    """One such message of any program on the bus ended the export with a traceback, or printed warnings of numpy."""
+    made = Mixed(path := tmp_path / "x.mcap")
+    wall = pb.SimWall(begin=pb.SimPoint(), end=pb.SimPoint(x_m=2.0))
+    messages: list[tuple[str, Any]] = [("fleet/@sim/world", pb.World(walls=[pb.SimWall(), wall]))]
+    for odd in (*ODD_NUMBERS, 1.0):
+        messages += [
+            ("fleet/red/sim/truth", pb.Truth(x_m=odd, heading_rad=odd)),
+            ("fleet/red/sensor/pose", pb.Pose(y_m=odd, heading_rad=odd)),
+            ("fleet/@sim/world", pb.World(lamps=[pb.SimLamp(x_m=odd)], things=[pb.SimThing(heading_rad=odd)])),
+            ("fleet/@sim/world", pb.World(line=[pb.SimPoint(x_m=odd), pb.SimPoint()])),
+        ]
+    for key, message in messages:
+        made.put(key, message.DESCRIPTOR.full_name, message.SerializeToString())
+    counts = made.close()
+    found = replayed(path)
+    assert found.shown == counts
+    assert not found.left_out.total
+    chunks = list(rrc.RrdReader(path.with_suffix(".rrd")).store().stream())
+    ways = {chunk.entity_path for chunk in chunks if chunk.entity_path.endswith("/way")}
+    assert ways == {"/fleet/red/sim/truth/way", "/fleet/red/sensor/pose/way"}
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        if chunk.entity_path in ways and "LineStrips3D:strips" in batch.schema.names:
+            ((strip,),) = batch.column("LineStrips3D:strips").to_pylist()
+            assert [list(map(float, point)) for point in strip] == [
+                [1.0, 0.0, 0.0] if "truth" in chunk.entity_path else [0.0, 1.0, 0.0]
+            ]
 
 
 def test_level_without_a_name_does_not_end_the_process(tmp_path: Path) -> None:
