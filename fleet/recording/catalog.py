@@ -18,6 +18,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from itertools import chain, count
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -239,17 +240,21 @@ class Catalog:
                 same = not cached.is_foreign(file)
                 columns = ours if same else self._columns(f"read_parquet([{_text(str(file))}])")
                 groups.setdefault(tuple(columns.items()), []).append(str(file))
-        parts = [f'SELECT NULL::VARCHAR AS session, * FROM "{empty}"']  # noqa: S608 - a name of ours
+        others = {column for group in groups for column, _ in group} - ours.keys()
+        titles = _titles([*ours, *sorted(others)])
+        blank = ", ".join(f"{_quoted(column)} AS {_quoted(titles[column])}" for column in ours)
+        parts = [f'SELECT NULL::VARCHAR AS session, {blank} FROM "{empty}"']  # noqa: S608 - all is quoted
         for group, files in groups.items():
             there = dict(group)
-            chosen = [_column(column, kind, there.get(column)) for column, kind in ours.items()]
+            chosen = [_column(column, kind, there.get(column), titles[column]) for column, kind in ours.items()]
             self._casts += [
                 _Cast(topic.name, column, kind, tuple(files))
                 for column, kind in ours.items()
                 if there.get(column, kind) != kind
             ]
             chosen += [
-                f"CAST({_quoted(column)} AS VARCHAR) AS {_quoted(column)}" for column in there.keys() - ours.keys()
+                f"CAST({_quoted(column)} AS VARCHAR) AS {_quoted(titles[column])}"
+                for column in there.keys() - ours.keys()
             ]
             listed = ", ".join(map(_text, files))
             parts.append(
@@ -325,12 +330,25 @@ def _empty(topic: Topic) -> "pa.Table":
     return ArrowSink(Layout(messages.message_class(topic.message).DESCRIPTOR).columns, "us").table()
 
 
-def _column(name: str, kind: str, there: str | None) -> str:
+def _titles(columns: Iterable[str]) -> dict[str, str]:
+    """Return the name in a view of each column of its files: such as `session_1`, because `session` is the view's own.
+
+    DuckDB ignores case in names, and cannot unite files in which two columns have one name.
+    """
+    taken = {"session"}
+    titles: dict[str, str] = {}
+    for column in columns:
+        free = chain([column], (f"{column}_{number}" for number in count(1)))
+        title = titles[column] = next(name for name in free if name.lower() not in taken)
+        taken.add(title.lower())
+    return titles
+
+
+def _column(name: str, kind: str, there: str | None, title: str) -> str:
     """Return the expression of a column of ours. `there` is its type in the files, or None if they lack it."""
     quoted = _quoted(name)
-    if there is None:
-        return f"NULL::{kind} AS {quoted}"
-    return quoted if there == kind else f"TRY_CAST({quoted} AS {kind}) AS {quoted}"
+    value = f"NULL::{kind}" if there is None else quoted if there == kind else f"TRY_CAST({quoted} AS {kind})"
+    return f"{value} AS {_quoted(title)}"
 
 
 def _quoted(name: str) -> str:

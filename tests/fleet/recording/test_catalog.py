@@ -39,6 +39,8 @@ from tests.support.processes import wait_for
 from tests.support.soaks import only_in_soak
 from tests.support.terminal import Terminal
 
+OLD_SESSION = Path(__file__).parents[2] / "vectors" / "session-0.1"
+
 
 def make(path: Path, car: str, distances: list[float]) -> None:
     """Make a session: one distance a second, in tracking from the third second on, driven by ann."""
@@ -360,17 +362,18 @@ def test_damaged_sessions_of_many_are_named_and_rest_counts(tmp_path: Path, coun
     assert found == count - 5, "five are noise"
 
 
-def old_schema(session: Path, kind: int, words: str = "0.75") -> None:
+def old_schema(session: Path, kind: int, words: str = "0.75", *, echo: str = "echo_us") -> None:
     """Make a session of an older version: another type of range_m, a field that we have not, and none that is newer."""
     file = descriptor_pb2.FileDescriptorProto(name="old.proto", package="fleet.v1", syntax="proto3")
     message = file.message_type.add(name="Range")
-    for number, (name, of) in enumerate((("range_m", kind), ("echo_us", message.field.add().TYPE_INT64))):
+    for number, (name, of) in enumerate((("range_m", kind), (echo, message.field.add().TYPE_INT64))):
         message.field.add(name=name, number=number + 1, type=of, label=1)
     del message.field[0]
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     made: Any = message_factory.GetMessageClass(pool.FindMessageTypeByName("fleet.v1.Range"))()
-    made.echo_us, made.range_m = 7, words if kind == message.field[0].TYPE_STRING else 3
+    setattr(made, echo, 7)
+    made.range_m = words if kind == message.field[0].TYPE_STRING else 3
     session.mkdir()
     with (session / "0001.mcap").open("wb") as out:
         writer: Any = Writer(out)
@@ -427,6 +430,32 @@ def test_session_of_other_schema_has_our_columns(sessions: Path, *, others: bool
         {"session": "words", "range_m": 0.75, "no_echo": None, "echo_us": "7", "mode": None},
     ]
     assert asked(sessions, "SELECT count(*) n FROM sensor_range WHERE range_m < 0.6") == [{"n": 2 if others else 0}]
+
+
+@pytest.mark.parametrize("name", ["session", "Range_M", "RANGE_m_1"])
+def test_columns_of_one_name_are_two_columns(sessions: Path, name: str) -> None:
+    """DuckDB refused them for each topic of which two versions have sessions, with a traceback for `--tables`."""
+    old_schema(sessions / "a", 3, echo=name)
+    old_schema(sessions / "b", 9, echo=name)
+    title = name if name == "RANGE_m_1" else f"{name}_1"
+    rows = asked(sessions, f"SELECT session, range_m, {title} AS other FROM sensor_range WHERE car = 'old' ORDER BY 1")
+    assert rows == [
+        {"session": "a", "range_m": 3.0, "other": "7"},
+        {"session": "b", "range_m": 0.75, "other": "7"},
+    ]
+
+
+def test_sessions_of_two_versions_have_all_tables(sessions: Path) -> None:
+    """A message of the recorder and one of the supervisor have a field `session`, too."""
+    shutil.copytree(OLD_SESSION, sessions / "old")
+    (sessions / "new").mkdir()
+    made = Made(sessions / "new" / "0001.mcap", Writer)
+    made.put("fleet/@supervisor/status", pb.Supervision(session="sessions/new"), 0)
+    made.close()
+    done = query("--tables", sessions)
+    assert (done.returncode, "supervisor_status" in done.stdout) == (0, True), done.stderr
+    rows = asked(sessions, "SELECT DISTINCT session, session_1 FROM supervisor_status ORDER BY session")
+    assert rows == [{"session": "new", "session_1": "sessions/new"}, {"session": "old", "session_1": None}]
 
 
 def test_value_null_for_its_type_is_named(sessions: Path) -> None:
