@@ -108,6 +108,6 @@ class CarTimeline(Struct):
 
 
 def message_time_ns(message: Any, at_ns: int) -> int:
-    """Return the stamp of a message, or `at_ns` if it has none."""
+    """Return the stamp of a message, or `at_ns` if it has none, or if another program's schema has something else."""
     stamp = getattr(message, "stamp", None) or getattr(message, "timestamp", None)
-    return (messages.stamp_ns(stamp) if stamp is not None else 0) or at_ns
+    return (messages.stamp_ns(stamp) if hasattr(stamp, "seconds") else 0) or at_ns

@@ -16,7 +16,7 @@ from fleet.policy.car_condition import CarCondition
 from fleet.policy.snapshot import is_in, topic_of
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_reader import ChannelInfo
-from fleet.recording.reading.message_decoder import MessageDecoder, why_not_decoded
+from fleet.recording.reading.message_decoder import MessageDecoder, number_of, why_not_decoded
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.car_timeline import message_time_ns
@@ -73,7 +73,7 @@ class ConditionRun:
         if topic == COMMANDS.name and getattr(message, "phase", "") == Phase.SENT:
             self._command = asked_by(message)
         if topic == MODE.name:
-            self._mode = getattr(message, "asked", "")
+            self._mode = str(getattr(message, "asked", ""))
         if topic not in self._condition.topics or (step := self._condition.add(topic, message, at_ns)) is None:
             return
         self._keep(step.ended)
@@ -149,9 +149,9 @@ def _messages(
             if key.topic in names:
                 left_out.add(info.channel.topic, cause)
             continue
-        stream = info.channel.topic, getattr(message, "boot_id", "")
+        stream = info.channel.topic, str(getattr(message, "boot_id", ""))
         at_ns = message_time_ns(message, publish_ns)
-        yield key.car, RecordedMessage(log_ns, at_ns, stream, getattr(message, "seq", 0), (key.topic, message))
+        yield key.car, RecordedMessage(log_ns, at_ns, stream, number_of(message), (key.topic, message))
 
 
 def _why_left_out(

@@ -11,6 +11,7 @@ where the sensors sit on the cars.
 import json
 import math
 import re
+import struct
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -213,6 +214,9 @@ _CONVERTERS: Final[Mapping[str, tuple[str, Callable[[Any, Any], Any]]]] = {
     "foxglove.Log": ("rcl_interfaces/msg/Log", _log),
 }
 """By full name: our messages for which ROS has a standard one."""
+_UNFIT: Final = (ValueError, OverflowError, AttributeError, TypeError, struct.error)
+"""Errors that say that ROS's message cannot hold a reading: any program can publish an infinite angle, and the schema
+of another version may lack a field of ours, or have it with another type."""
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 
 
@@ -284,14 +288,17 @@ def write_bag(rows: Iterable[Row], out: Path) -> Bag:
 
 def _convert(message: Message, key: str, publish_ns: int) -> tuple[str, Any]:
     """Return the ROS type and the serialized message."""
-    header = _ros("std_msgs/msg/Header", stamp=_stamp(message_time_ns(message, publish_ns)), frame_id=_frame(key))
     kind, convert = _CONVERTERS.get(message.DESCRIPTOR.full_name, (DIAGNOSTICS, None))
     if convert is not None:
         try:
-            return kind, _STORE.serialize_cdr(convert(message, header), kind)
-        except (ValueError, OverflowError):
-            pass  # any program can publish a number that ROS's message cannot hold, such as an infinite angle
-    return DIAGNOSTICS, _STORE.serialize_cdr(_diagnostics(message, header, key), DIAGNOSTICS)
+            return kind, _STORE.serialize_cdr(convert(message, _header(message, key, publish_ns)), kind)
+        except _UNFIT:
+            pass
+    return DIAGNOSTICS, _STORE.serialize_cdr(_diagnostics(message, _header(message, key, publish_ns), key), DIAGNOSTICS)
+
+
+def _header(message: Message, key: str, publish_ns: int) -> Any:
+    return _ros("std_msgs/msg/Header", stamp=_stamp(message_time_ns(message, publish_ns)), frame_id=_frame(key))
 
 
 @cache

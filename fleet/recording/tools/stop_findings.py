@@ -117,8 +117,9 @@ def failed_stop_code(topic: str, message: Any) -> str:
 
 
 def asked_by(event: Any) -> str:
-    """Return verb and person of a fleet.v1.CommandEvent: `stop by mia`."""
-    return f"{event.verb} by {name_of(event.sender) or 'somebody'}"
+    """Return verb and person of a fleet.v1.CommandEvent: `stop by mia`. The schema of its recording may lack both."""
+    verb, sender = (str(getattr(event, name, "")) for name in ("verb", "sender"))
+    return f"{verb or 'a command'} by {name_of(sender) or 'somebody'}"
 
 
 def log_code(record: Any) -> str:

@@ -215,7 +215,7 @@ def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]
         return list(about.marks)
     found: list[Mapping[str, Any]] = list(about.marks)
     for log_ns, message in _messages(session, about, MARK_TOPIC_NAME):
-        text, by = getattr(message, "message", ""), getattr(message, "name", "")
+        text, by = (str(getattr(message, name, "")) for name in ("message", "name"))
         found.append({"time": time_spec.iso(log_ns), "text": text, "by": by})
     return found
 

@@ -142,8 +142,13 @@ class RequestColumns:
 
     @classmethod
     def of(cls, descriptor: Any) -> Self | None:
-        """Return the columns for messages of this type, or None if it is not an event of a command."""
-        return cls(descriptor) if descriptor.full_name == TOPICS["event/command"].message else None
+        """Return the columns for messages of this type, or None if it is not an event of a command.
+
+        Also return None if its schema lacks the fields from which a request is read, or has them with other types.
+        """
+        is_event = descriptor.full_name == TOPICS["event/command"].message
+        kinds = {field.name: field.type for field in descriptor.fields if not field.is_repeated}
+        return cls(descriptor) if is_event and _REQUEST_FIELDS.items() <= kinds.items() else None
 
     def fill(self, events: Sequence[Any]) -> list[Values]:
         """Return the values of the columns."""
@@ -170,6 +175,12 @@ class RequestColumns:
 
 
 _REQUEST_UNITS: Final = ("s", "deg")
+_REQUEST_FIELDS: Final = {
+    "verb": FieldDescriptor.TYPE_STRING,
+    "request": FieldDescriptor.TYPE_BYTES,
+    "request_encoding": FieldDescriptor.TYPE_STRING,
+}
+"""The fields of a command event from which its request is read, with their types."""
 
 
 def text_or_hex(payload: bytes) -> str:
@@ -221,8 +232,7 @@ def column_of(field: Any, name: str, unit: str) -> tuple[Column, Callable[[Seque
                 [convert(value) for value in get(message)] for message in messages
             ]
         return Column(name, ColumnKind.JSON, unit), lambda messages: [
-            json.dumps([plain(value) if kind is ColumnKind.JSON else convert(value) for value in get(message)])
-            for message in messages
+            json.dumps([_plain_value(field, value) for value in get(message)]) for message in messages
         ]
     column = Column(name, kind, unit)
     if kind is ColumnKind.JSON:

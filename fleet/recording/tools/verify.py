@@ -8,7 +8,7 @@ from msgspec import Struct, field, to_builtins
 
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema, message_of
+from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema, message_of, number_of
 from fleet.recording.reading.session import Session
 from fleet.recording.sequence_tracker import PublisherSequence
 from fleet.recording.tools.merge_cut_recover import lost_words
@@ -175,8 +175,8 @@ class _Verifier:
                 verdict.undecoded[key] = verdict.undecoded.get(key, 0) + 1
             else:
                 publisher = str(getattr(message, "boot_id", "") or getattr(message, "sender", ""))
-                if getattr(message, "boot_id", "") and getattr(message, "seq", 0):
-                    number, own = int(message.seq), True
+                if getattr(message, "boot_id", "") and (own_number := number_of(message)):
+                    number, own = own_number, True
         newest = True
         if number:
             stream = self._streams.get((key, publisher))

@@ -20,7 +20,7 @@ import rerun.chunk as rrc
 
 from fleet.recording.tools.summary import MARK_TOPIC_NAME
 from fleet.replay import panels
-from fleet.replay.rerun.lenses import component, is_drawn, numbers, triples
+from fleet.replay.rerun.lenses import OTHER_FIELDS, component, is_drawn, numbers, triples
 from fleet.replay.rerun.staleness import LOG_TIMELINE, PUBLISH_TIMELINE, StaleStates
 from fleet.replay.state_colors import OFF, rgb
 from schemas import keys, messages
@@ -45,6 +45,8 @@ MAX_NS: Final = 2**63
 MAX_NUMBER: Final = float(np.finfo(np.float32).max)
 """Rerun draws places and sizes as float32. What has a larger number, or one that is not finite, has no place: any
 program can publish it."""
+_PLACE: Final = ("x_m", "y_m")
+_SHAPE: Final = ("heading_rad", "radius_m", "width_m", "depth_m")
 _Times = dict[str, Any]
 _MAX_LEDS: Final = 256
 """Maximum number of LED colors that tracks can show, and of LED commands that await their outcome."""
@@ -102,7 +104,8 @@ class Drawing:
                 continue
             if component(topic) in batch.schema.names:
                 times = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in TIMELINES}
-                yield from draw(chunk.entity_path, batch.column(component(topic)).flatten(), times)
+                with suppress(*OTHER_FIELDS):
+                    yield from list(draw(chunk.entity_path, batch.column(component(topic)).flatten(), times))
 
     def _extend_span(self, published: Any) -> None:
         ends = pc.min_max(published.cast(pa.int64())).as_py()
@@ -201,8 +204,8 @@ class Drawing:
         x, y, leds = numbers(truths, "x_m"), numbers(truths, "y_m"), truths.field(_LED).dictionary_encode()
         self._extend_path(path, x, y)
         seen = leds.dictionary.to_pylist()
-        self._add_leds(seen)
         tints = _tints(rgb(each) for each in seen)[leds.indices.to_numpy(zero_copy_only=False)]
+        self._add_leds(seen)
         discs = rr.Points3D.columns(positions=triples(x, y), colors=tints, radii=np.full(len(x), 0.07))
         yield rrc.Chunk.from_columns(f"{path}/{_LED}", indexes=_indexes(times), columns=discs)
 
@@ -213,7 +216,7 @@ class Drawing:
     def _world(self, path: str, worlds: Any, times: _Times) -> Iterator[Any]:
         rows = worlds.to_pylist()
         yield from self._static_world(path, rows[-1])
-        lamps = [_placed(row["lamps"]) for row in rows]
+        lamps = [_placed(row["lamps"], *_PLACE) for row in rows]
         if any(lamps):
             every = [lamp for row in lamps for lamp in row]
             points = rr.Points3D.columns(
@@ -224,7 +227,7 @@ class Drawing:
             )
             points = points.partition([len(row) for row in lamps])
             yield rrc.Chunk.from_columns(f"{path}/lamps", indexes=_indexes(times), columns=points)
-        things = [_placed(row["things"]) for row in rows]
+        things = [_placed(row["things"], *_PLACE, *_SHAPE) for row in rows]
         if any(things):
             every = [thing for row in things for thing in row]
             boxes = rr.Boxes3D.columns(
@@ -239,9 +242,9 @@ class Drawing:
 
     def _static_world(self, path: str, world: Any) -> Iterator[Any]:
         """Yield the walls and the taped line once, and again if they change."""
-        ends = [_placed([wall["begin"], wall["end"]]) for wall in world["walls"] or ()]
+        ends = [_placed([wall["begin"], wall["end"]], *_PLACE) for wall in world["walls"] or ()]
         walls = [[_point(begin), _point(end)] for begin, end in (each for each in ends if len(each) == 2)]
-        line = [_point(each) for each in _placed(world["line"])]
+        line = [_point(each) for each in _placed(world["line"], *_PLACE)]
         strips = {
             "walls": (walls, _WALL_COLOR, 0.03),
             "line": ([[*line, line[0]]] if line else [], _TAPE_COLOR, 0.0125),
@@ -326,13 +329,13 @@ def _led_color(event: dict[str, Any]) -> str:
     )
 
 
-def _placed(parts: Iterable[dict[str, Any] | None] | None) -> list[dict[str, Any]]:
-    """Return those parts of a world that are there, and can be drawn."""
-    return [part for part in parts or () if part is not None and all(map(_is_drawable, part.values()))]
+def _placed(parts: Iterable[dict[str, Any] | None] | None, *names: str) -> list[dict[str, Any]]:
+    """Return those parts of a world that are there, and of which all these numbers can be drawn."""
+    return [part for part in parts or () if part is not None and all(_is_drawable(part[name]) for name in names)]
 
 
 def _is_drawable(value: Any) -> bool:
-    return not isinstance(value, float) or abs(value) <= MAX_NUMBER
+    return isinstance(value, float) and abs(value) <= MAX_NUMBER
 
 
 def _point(point: dict[str, float]) -> tuple[float, float, float]:

@@ -28,7 +28,12 @@ RAW: Final = "McapMessage:data"
 
 _ARROW_M: Final = 0.25
 """Length of the arrow of a car."""
+_POINT: Final = pa.list_(pa.float32(), 3)
+"""Rerun's type for points and vectors."""
 _Pipe = Callable[[Any], Any]
+OTHER_FIELDS: Final = (KeyError, TypeError, AttributeError, pa.ArrowException)
+"""Errors that say that the schema of a recording lacks a field, or has it with another type. A recording of another
+version may have such a schema. Its messages are shown, without what is derived from that field."""
 
 
 def component(topic: str) -> str:
@@ -59,10 +64,10 @@ def lenses() -> list[Any]:
         ):
             derived[part.topic] = lens(part.topic).to_component(part.name, _selector(part))
     for words in panels.TEXT_LINES:
-        line = rrc.Selector(".").pipe(_line(words.fields, words.before))
+        line = rrc.Selector(".").pipe(_or_nothing(_line(words.fields, words.before), pa.string()))
         derived[words.topic] = lens(words.topic).to_component(rr.TextLog.descriptor_text(), line, cast_to="auto")
         if words.alarm_field:
-            level = rrc.Selector(f".{words.alarm_field}").pipe(_level(words.calm))
+            level = rrc.Selector(f".{words.alarm_field}").pipe(_or_nothing(_level(words.calm), pa.string()))
             derived[words.topic] = derived[words.topic].to_component(
                 rr.TextLog.descriptor_level(), level, cast_to="auto"
             )
@@ -72,8 +77,12 @@ def lenses() -> list[Any]:
     for topic in (panels.TRUTH, panels.POSE):
         derived[topic] = (
             lens(topic)
-            .to_component(rr.Arrows3D.descriptor_origins(), rrc.Selector(".").pipe(_origins), cast_to="auto")
-            .to_component(rr.Arrows3D.descriptor_vectors(), rrc.Selector(".").pipe(_vectors), cast_to="auto")
+            .to_component(
+                rr.Arrows3D.descriptor_origins(), rrc.Selector(".").pipe(_or_nothing(_origins, _POINT)), cast_to="auto"
+            )
+            .to_component(
+                rr.Arrows3D.descriptor_vectors(), rrc.Selector(".").pipe(_or_nothing(_vectors, _POINT)), cast_to="auto"
+            )
         )
     return list(derived.values())
 
@@ -93,7 +102,20 @@ def _selector(part: StateTrack | Curve) -> Any:
     selector = rrc.Selector(f".{part.field}")
     if part.derivation is None:
         return selector
-    return selector.pipe(_PIPES[part.derivation])
+    kind = pa.float64() if part.derivation in _NUMBERS else pa.string()
+    return selector.pipe(_or_nothing(_PIPES[part.derivation], kind))
+
+
+def _or_nothing(pipe: _Pipe, kind: Any) -> _Pipe:
+    """Return a pipe that yields nulls of this type if the messages lack what it needs (OTHER_FIELDS)."""
+
+    def nulls_instead(values: Any) -> Any:
+        try:
+            return pipe(values)
+        except OTHER_FIELDS:
+            return pa.nulls(len(values), kind)
+
+    return nulls_instead
 
 
 def _text_or_nothing(texts: Any) -> Any:
@@ -120,6 +142,8 @@ _PIPES: Final[dict[Derivation, _Pipe]] = {
     Derivation.LOW: _level_at(LOW_V),
     Derivation.CRITICAL: _level_at(CRITICAL_V),
 }
+_NUMBERS: Final = (Derivation.TOTAL, Derivation.LOW, Derivation.CRITICAL)
+"""Derivations that are numbers. The others are text."""
 
 
 def _line(fields: Sequence[str], before: Mapping[str, str]) -> _Pipe:

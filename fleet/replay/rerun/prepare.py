@@ -18,7 +18,7 @@ from fleet.recording.left_out import LeftOut, LeftOutCause, has_unknown_enum, ma
 from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_index import Index
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import MessageDecoder
+from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
 
@@ -83,8 +83,8 @@ def copied(
 ) -> Prepared:
     """Copy the messages into files that Rerun reads completely. Raises OSError if they cannot be written.
 
-    wanted: returns True for a key to copy. scratch: an existing directory. refused: names of schemas that Rerun
-    refuses.
+    wanted: returns True for a key to copy. scratch: an existing directory. refused: names of schemas of
+    which Rerun refuses those that are not ours.
     """
     prepared = Prepared([])
     decoder = MessageDecoder()
@@ -163,7 +163,11 @@ def _refusal(decoder: MessageDecoder, info: ChannelInfo, refused: Collection[str
     if info.schema is not None and info.schema.encoding == "protobuf":
         if info.channel.message_encoding != "protobuf":
             return LeftOutCause.NOT_PROTOBUF
-        if decoder.class_of(info) is None or info.schema.name in refused:
+        message_class = decoder.class_of(info)
+        if message_class is None:
+            return LeftOutCause.BAD_SCHEMA
+        # Another schema of this name in the session may be ours, which Rerun reads.
+        if info.schema.name in refused and compare_schema(message_class) != SAME_SCHEMA:
             return LeftOutCause.BAD_SCHEMA
     return None
 

@@ -36,6 +36,8 @@ APPLICATION: Final = "zenoh-car-fleet"
 _BAD_SCHEMA: Final = re.compile(r"Invalid schema ([\w.]+)")
 """Found in Rerun's error for a file that has a damaged schema. We can read such a file, but Rerun reads nothing of
 it."""
+_BAD_FIELD: Final = re.compile(rf"Lenses error: .* input: `([\w.]+){MESSAGE_SUFFIX}`")
+"""Found in Rerun's error for a field that is drawn, but has another type in a file."""
 _INTERRUPT: Final = re.compile(rf"\b{KeyboardInterrupt.__name__}\b")
 _TOPIC: Final = "McapChannel:topic"
 _LOGS: Final = tuple(f"/{topic.name}" for topic in TOPICS.values() if topic.message == "foxglove.Log")
@@ -88,10 +90,10 @@ WHOLE_SESSION: Final = Part()
 
 
 class _SchemaRefused(Exception):
-    """Rerun refuses the schema of this name."""
+    """Rerun refuses the schema of this name, or the type of a field in it."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(f"the schema {name} is damaged")
+        super().__init__(f"the schema {name} is damaged, or another program's")
         self.name = name
 
 
@@ -177,7 +179,7 @@ def _write(
         words = " ".join(str(error).split())
         if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun turns the exception into text
             raise KeyboardInterrupt from None
-        if refused := _BAD_SCHEMA.search(words):
+        if refused := _BAD_SCHEMA.search(words) or _BAD_FIELD.search(words):
             recording.disconnect()
             raise _SchemaRefused(refused[1]) from None
         raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
