@@ -6,6 +6,7 @@ It is for experiments with a car on the desk. It does not pace or repeat frames,
 
 import argparse
 import asyncio
+import contextlib
 import re
 import shlex
 from typing import Final
@@ -25,7 +26,7 @@ from gateway.drivers.yahboom.protocol.frames import (
 from gateway.drivers.yahboom.protocol.modes import MODES
 from gateway.drivers.yahboom.protocol.platforms import Profile, StopStyle
 from gateway.drivers.yahboom.protocol.timing import BYTES_PER_S, FRAME_S, LONGEST_BLOCK_S
-from gateway.link import LinkUrl, open_link, parse_url
+from gateway.link import Link, LinkLost, LinkUrl, open_link, parse_url
 from gateway.tools import cli_support
 from schemas.links import LINK_HELP
 from schemas.words import Mode, Motion, Platform
@@ -45,6 +46,9 @@ Opening a serial port can reset an Arduino that is on a USB cable. It misses eve
 two seconds. With --wait 3s the frame is sent after the start."""
 
 MAX_WAIT_S: Final = 60.0
+REFUSAL_S: Final = 0.5
+"""Time after the write in which the end of the link shows that the frame may not have arrived. A bridge that has a
+client already accepts another connection, says so, and closes it."""
 _STOP: Final = encode(General(Motion.STOP)).decode()
 _MANUAL: Final = encode(ModeClose()).decode()
 _FORMS: Final = (
@@ -54,6 +58,10 @@ _FORMS: Final = (
 _PLACES: Final = ("motion", "rotate", "whistle", "speed", "servo", "sing", "light", "fan", "servo reset")
 # The rest of a frame after a shell has replaced its `$0` or `$4` by the shell's name or by nothing.
 _EXPANDED: Final = re.compile(r"(?P<name>[^,$]*)(?P<rest>(?:,\d){8}#?)|(?P<named>WD,[A-Za-z0-9,]+#?)")
+
+
+class _EndedAfterWrite(LinkLost):
+    """The link ended right after the frame was written, so the frame may not have arrived."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,20 +85,37 @@ def _run(arguments: argparse.Namespace) -> None:
     wait_s = 0.0 if arguments.wait is None else cli_support.duration("--wait", arguments.wait, 0.0, MAX_WAIT_S)
     data = raw_bytes(arguments.frame) if arguments.raw else check_frame(arguments.frame, profile, url)
     cli_support.warn_before_opening(url)
-    cli_support.run_until_interrupted(_send(url, data, wait_s))
-    sent = f"sent {cli_support.printable(data)} to {url}"
-    cli_support.print_lines([sent, *aftermath(profile.parse_sent(data), profile, arguments.link)])
+    words, after = cli_support.printable(data), aftermath(profile.parse_sent(data), profile, arguments.link)
+    try:
+        cli_support.run_until_interrupted(_send(url, data, wait_s))
+    except _EndedAfterWrite:
+        cli_support.print_lines(
+            [f"wrote {words} to {url}, and the link ended: perhaps it did not arrive. If it did:", *after]
+        )
+        raise
+    cli_support.print_lines([f"sent {words} to {url}", *after])
 
 
 async def _send(url: LinkUrl, data: bytes, wait_s: float) -> None:
     link = await open_link(url)
     try:
-        await asyncio.sleep(wait_s)
+        await _watch(link, wait_s)
         await link.write(data)
-        # Wait until the bytes are sent: a port that is closed earlier may truncate them.
-        await asyncio.sleep(len(data) / BYTES_PER_S + FRAME_S)
+        try:
+            # Wait until the bytes are sent: a port that is closed earlier may truncate them.
+            await _watch(link, max(REFUSAL_S, len(data) / BYTES_PER_S + FRAME_S))
+        except LinkLost as error:
+            raise _EndedAfterWrite(str(error)) from None
     finally:
         await link.close()
+
+
+async def _watch(link: Link, seconds: float) -> None:
+    """Wait, and discard what the car sends meanwhile. Raises LinkLost if the link ends."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            while True:
+                await link.read()
 
 
 def raw_bytes(text: str) -> bytes:

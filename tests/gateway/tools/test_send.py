@@ -1,8 +1,11 @@
 """`gateway send` as a process: frames to a car, refused frames with reasons, and warnings about the car."""
 
+import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -136,6 +139,35 @@ def test_unstoppable_tcp_car_is_not_started(command: Command) -> None:
         assert car.received == [STOP.encode(), RUN.encode(), b"$9,junk"]
     finally:
         car.close()
+
+
+@contextmanager
+def bridge_in_use(words: bytes) -> Iterator[str]:
+    """Serve one connection: say the words, end this side, and read until the client ends, too. Yield the link."""
+
+    def refuse() -> None:
+        peer, _ = listener.accept()
+        with peer:
+            peer.sendall(words)
+            peer.shutdown(socket.SHUT_WR)
+            while peer.recv(4096):
+                pass
+
+    with socket.create_server(("127.0.0.1", 0)) as listener, ThreadPoolExecutor(1) as pool:
+        refusing = pool.submit(refuse)
+        yield f"tcp://127.0.0.1:{listener.getsockname()[1]}"
+        refusing.result()
+
+
+@pytest.mark.parametrize("wait", [(), ("--wait", "10")])
+def test_frame_to_a_bridge_that_is_in_use_is_not_said_to_be_sent(command: Command, wait: tuple[str, ...]) -> None:
+    """ser2net accepts a second client, says that it has one, and closes. The frame reaches no car."""
+    with bridge_in_use(b"Port already in use\r\n") as link:
+        done = command("send", "--link", link, *wait, STOP)
+    assert done.returncode == 1
+    assert has_parts(done.stderr, 'said "Port already in use"')
+    assert not done.stdout.startswith("sent ")
+    assert has_parts(done.stdout, f"wrote {STOP} … perhaps it did not arrive") is not bool(wait)
 
 
 def test_every_mode_has_its_words(command: Command) -> None:
