@@ -231,6 +231,16 @@ class CarState(Struct):
         return bool(self.link.state == LinkState.STALE)
 
     @property
+    def is_unreadable(self) -> bool:
+        """True if the link is open, and bytes arrive that are no readings.
+
+        A reading brings a stale link back. So bytes that came long after the link became stale are none.
+        """
+        if self.link.state != LinkState.STALE or self.last_rx_s is None:
+            return False
+        return bool(self.last_rx_s < min(_UNHEARD_S, self.link.since_s - _UNHEARD_S))
+
+    @property
     def is_unheard(self) -> bool:
         """True if the link is open, but the car was not heard.
 
@@ -254,6 +264,8 @@ class CarState(Struct):
             return ""
         if link.state == LinkState.LOST:
             return f"link lost: {link.reason}" if link.reason else "link lost"
+        if self.is_unreadable:
+            return "bytes come, but no reading: `fleet doctor` says more"
         if link.state == LinkState.STALE:  # commands are still sent to such a car
             return "silent: is it switched on?"
         if safety.waits_for:

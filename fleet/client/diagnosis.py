@@ -201,13 +201,22 @@ def _baud(e: CarEvidence) -> str:
     return "Bytes arrive, but never a frame: a wrong baud rate?" if link.rejects.get("no_frames", 0) else ""
 
 
+def _unreadable(e: CarEvidence) -> str:
+    if not e.state.is_unreadable or _baud(e):
+        return ""
+    return (
+        "Bytes arrive, but have been no reading for a while: echoes of our own frames, another device, another baud "
+        "rate, or damage on the way."
+    )
+
+
 def _silent_fan(e: CarEvidence) -> str:
-    silent_by_fan = e.state.is_silent and e.state.motion.fan
+    silent_by_fan = e.state.is_silent and e.state.motion.fan and not e.state.is_unreadable
     return "The car is silent, and its fan runs: some cars send nothing while the fan runs." if silent_by_fan else ""
 
 
 def _silent_car(e: CarEvidence) -> str:
-    if not e.state.is_silent or e.state.motion.fan or _baud(e):
+    if not e.state.is_silent or e.state.is_unreadable or e.state.motion.fan or _baud(e):
         return ""
     last_rx_s = e.state.last_rx_s
     since = "since its link opened" if last_rx_s is None else f"for {last_rx_s:.0f} s"
@@ -345,6 +354,7 @@ CHECKS: Final = (
     DoctorCheck("platform_contradicted", _contradicted, "fleet bind"),
     DoctorCheck("not_shown", _doubted, "fleet stop {car}"),
     DoctorCheck("no_frames", _baud, "fleet logs {car}"),
+    DoctorCheck("no_reading", _unreadable, "fleet watch {car}/frame/rx"),
     DoctorCheck("fan_silence", _silent_fan, "fleet fan {car}"),
     DoctorCheck(_SILENT, _silent_car, "fleet watch '{car}/sensor/*'"),
     DoctorCheck(_PORT_SHARED, _shared, "fleet logs {car}"),

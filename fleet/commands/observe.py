@@ -142,6 +142,7 @@ def row_of(
         "why_not_ready": why_not_ready or "",
         "waits_for": None if state.current("state/safety") is None else safety.waits_for,
         "unheard": state.is_unheard,
+        "unreadable": state.is_unreadable,
         "last_rx_s": round(link.last_rx_s, 3) if link.HasField("last_rx_s") else None,
         "platform": health.platform or None,
         "platform_contradictions": list(health.platform_contradictions),
@@ -186,6 +187,8 @@ def cell_text(name: str, row: Mapping[str, Any]) -> str:
     if name == "platform" and row["platform_contradictions"]:
         return f"{row['platform']} (contradicted)"
     if name == "link" and row["unheard"]:
+        if row["unreadable"]:
+            return f"{row['link']} (bytes, no reading)"
         silence = "no reading yet" if row["last_rx_s"] is None else f"silent for {row['last_rx_s']:.0f} s"
         return f"{row['link']} ({silence})"
     if name == "ready":

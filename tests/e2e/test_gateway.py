@@ -15,6 +15,8 @@ from typing import Any
 import pytest
 import serial
 
+from fleet.client.car_state import CarState
+from fleet.client.diagnosis import CarEvidence, diagnose
 from schemas import bus
 from schemas.limits import SHUTDOWN_S
 from tests.support.judge import Judge
@@ -535,6 +537,26 @@ def test_dropped_link_reconnects(fleet: FleetProcesses, tmp_path: Path) -> None:
     assert ended == [("failed", "link_down")]
     assert fleet.ask("drive", motion="forward", duration_s=0.3)["status"] in TAKEN
     assert gateway.end() == 0
+
+
+def test_bytes_that_are_no_readings_are_not_called_silence(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
+    """The link carries noise, too little of it to doubt the baud rate. Nobody should look for a car that is off."""
+    fleet.gateway(tcp_car.link)
+    wait_for(lambda: tcp_car.received, "it has connected")
+
+    def known() -> CarState:
+        tcp_car.send(b"\xf8")
+        state = CarState("red")
+        for topic in ("link", "safety", "health"):
+            state.take(f"state/{topic}", fleet.state(topic), time.time())
+        return state
+
+    wait_for(lambda: known().is_unreadable, "the noise counts as bytes that are no readings")
+    state = known()
+    assert has_parts(state.why_not_ready(time.time()) or "", "bytes come, but no reading")
+    found = {each.code for each in diagnose(CarEvidence(state, time.time(), asked=True))}
+    assert "no_reading" in found
+    assert "silent" not in found
 
 
 def test_link_that_dies_at_once_is_not_reopened_in_a_loop(fleet: FleetProcesses) -> None:

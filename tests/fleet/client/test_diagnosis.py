@@ -55,6 +55,7 @@ ODD: dict[str, CarEvidence] = {
     "no_frames": with_states(
         link=pb.Link(state="stale", last_rx_s=12, rx_frames=40, rejects={"no_start": 40, "wrong_baud": 1})
     ),
+    "no_reading": with_states(link=pb.Link(state="stale", since_s=60, last_rx_s=0.4, rx_frames=900)),
     "fan_silence": with_states(link=STALE, motion=pb.Motion(fan=True)),
     "silent": with_states(link=STALE),
     "port_shared": with_states(link=pb.Link(state="online", rx_frames=90, rejects={"port_shared": 1})),

@@ -27,6 +27,8 @@ def row(**messages: Any) -> dict[str, Any]:
         (pb.Link(state="lost", last_rx_s=40), "unknown", False, "lost"),
         (pb.Link(state="stale", last_rx_s=12.2), "off", True, "stale (silent for 12 s)"),
         (pb.Link(state="stale"), "unknown", True, "stale (no reading yet)"),
+        (pb.Link(state="stale", since_s=9, last_rx_s=0.4), "unknown", True, "stale (bytes, no reading)"),
+        (pb.Link(state="stale", since_s=9, last_rx_s=8.6), "unknown", True, "stale (silent for 9 s)"),
         (pb.Link(state="online", last_rx_s=24), "unknown", True, "online (silent for 24 s)"),
         (pb.Link(state="online", last_rx_s=1), "unknown", False, "online"),
     ],
