@@ -45,8 +45,9 @@ MIN_ODD_RECONNECTS: Final = 2
 _NOT_OBEYED: Final = "not_obeyed"
 _SILENT: Final = "silent"
 _PORT_SHARED: Final = "port_shared"
+_FLOOD_BYTES: Final = "flood_bytes"
 _BAUD_DOUBTS: Final = ("wrong_baud", "no_frames")
-_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, "flood_bytes", "raw_not_published", "text"})
+_NO_FRAMES: Final = frozenset({_NOT_OBEYED, _PORT_SHARED, *_BAUD_DOUBTS, _FLOOD_BYTES, "raw_not_published", "text"})
 """The names in a link's `rejects` that do not count rejected frames."""
 FAILED_PHASES: Final = (Phase.REJECTED, Phase.FAILED, Phase.EXPIRED)
 """Phases of a command that was not carried out."""
@@ -165,8 +166,9 @@ def _lost(e: CarEvidence) -> str:
     link = e.state.link
     if link.state != LinkState.LOST or _adapter_full(e):
         return ""
-    reason = link.reason.rstrip(".") or "no reason is known"  # some reasons are sentences
-    return f"The link has been lost for {link.since_s:.0f} s: {reason}."
+    reason = link.reason or "no reason is known"
+    end = "" if reason.endswith((".", "?")) else "."  # some reasons are sentences
+    return f"The link has been lost for {link.since_s:.0f} s: {reason}{end}"
 
 
 def _contradicted(e: CarEvidence) -> str:
@@ -239,6 +241,14 @@ def _damaged(e: CarEvidence) -> str:
         return ""
     worst = max(e.rejected, key=lambda cause: e.rejected[cause])
     return f"{count} of {link.rx_frames} frames were not readings, most of them {worst}. The wire or the radio is bad."
+
+
+def _poured(e: CarEvidence) -> str:
+    count = e.state.link.rejects.get(_FLOOD_BYTES, 0)
+    if not count:
+        return ""
+    words = f"More bytes came than any car sends, and {count} were discarded unread"
+    return f"{words}: another device, or a wrong baud rate?"
 
 
 def _estopped(e: CarEvidence) -> str:
@@ -360,6 +370,7 @@ CHECKS: Final = (
     DoctorCheck(_PORT_SHARED, _shared, "fleet logs {car}"),
     DoctorCheck("out_of_range", _out_of_range, "fleet watch {car}/frame/rx"),
     DoctorCheck("damaged_frames", _damaged, "fleet watch {car}/frame/rx"),
+    DoctorCheck("flood", _poured, "fleet logs {car}"),
     DoctorCheck("estopped", _estopped, "fleet resume {car} --estops"),
     DoctorCheck("paused", _paused, "fleet unpause"),
     DoctorCheck("mode_contradicted", _other_mode, "fleet stop {car}"),
