@@ -21,6 +21,7 @@ from fleet.recording.reading.mcap_reader import Extra, Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import EVERYTHING, Selection
 from fleet.recording.tools.merged_losses import MergedLosses
+from fleet.recording.tools.number_gaps import NumberGaps
 from fleet.recording.tools.tables import car_of
 
 COPIED: Final = ("fleet.yaml", "plan.yaml")
@@ -112,8 +113,15 @@ def cut(
         car = car_of(key)
         return not names or car in names or car.startswith("@")
 
+    numbers = NumberGaps()
+    is_whole_time = selection.start_ns is None and selection.end_ns is None
+
     def part() -> Iterator[Row]:
-        return (row for row in session.rows(selection) if is_chosen(row[0].channel.topic))
+        for row in session.rows(selection):
+            if is_chosen(row[0].channel.topic):
+                if not is_whole_time:
+                    numbers.add(row)
+                yield row
 
     with atomic_directory(out) as new:
         count = _copy(with_progress(part()), new, session)
@@ -123,13 +131,14 @@ def cut(
         bounds = [None if ns is None else time_spec.iso(ns) for ns in (selection.start_ns, selection.end_ns)]
         about = {"by": "cut", "from": bounds[0], "to": bounds[1], "cars": sorted(names), "lost": lost}
         made = _described(session, new, count, about, selection)
-        # The recorder has counted its losses for the whole session. In a part of that time, `verify` finds those that
-        # are inside by the numbers of the messages.
-        is_whole_time = bounds == [None, None]
-        made.drops, made.missed = (
+        # The recorder has counted its losses for the whole session. In a part of that time, the numbers of the messages
+        # show how many are missing inside: lost ones, and those that a backfill brought only after this part.
+        made.drops, made.missed, made.recovered = (
             {key: lost for key, lost in each.items() if is_whole_time and is_chosen(key) and selection.has_key(key)}
-            for each in (made.drops, made.missed)
+            for each in (made.drops, made.missed, made.recovered)
         )
+        if not is_whole_time:
+            made.missed = numbers.missing()
         made.write(new)
         _copy_others(session, new)
     return count
@@ -166,7 +175,7 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
                 twice += 1
                 continue
             seen.add(told)
-            losses.on_written(info.channel.topic, row[2])
+            losses.on_written(row)
             yield row
 
     with atomic_directory(out) as new:

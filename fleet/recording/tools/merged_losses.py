@@ -3,13 +3,16 @@
 A recorder counts the messages that it dropped, and those that never reached it. Another recorder of the same time may
 have them. So each message of another session, within the time of a session that does not have it, makes up for one loss
 of that session. Losses of sessions that overlap may be the same messages, so the result is a number that was surely
-lost, and more may be.
+lost, and more may be. If a session was cut in two, a backfill may have brought messages of the first part in the time
+of the second one. So what only parts miss counts only if the numbers in the merged session have a gap.
 """
 
 from collections.abc import Mapping, Sequence
 
+from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.session_dir import SessionInfo
 from fleet.recording.time_spec import iso_ns
+from fleet.recording.tools.number_gaps import NumberGaps
 
 _FOREVER_NS = 2**63
 
@@ -24,6 +27,13 @@ class MergedLosses:
             for number, info in enumerate(sessions)
             if info is not None and (info.drops or info.missed)
         }
+        infos = [info for info, _ in self._lossy.values()]
+        self._of_parts = {key for info in infos if _is_part(info) for key in info.missed} - {
+            key for info in infos for key in (*info.drops, *(() if _is_part(info) else info.missed))
+        }
+        """Keys of which only parts miss messages. These may be in another part of the same session."""
+        self._numbers = NumberGaps()
+        """The numbers of these keys in the merged session."""
         self._own: dict[tuple[int, str], int] = {}
         """Number of messages of each key, by session."""
         self._merged: dict[tuple[int, str], int] = {}
@@ -34,8 +44,11 @@ class MergedLosses:
         if number in self._lossy:
             self._own[number, key] = self._own.get((number, key), 0) + 1
 
-    def on_written(self, key: str, log_ns: int) -> None:
+    def on_written(self, row: Row) -> None:
         """Count a message of the merged session."""
+        key, log_ns = row[0].channel.topic, row[2]
+        if key in self._of_parts:
+            self._numbers.add(row)
         for number, (_, (begin_ns, end_ns)) in self._lossy.items():
             if begin_ns <= log_ns <= end_ns:
                 self._merged[number, key] = self._merged.get((number, key), 0) + 1
@@ -46,6 +59,9 @@ class MergedLosses:
         missed: dict[str, int] = {}
         for key in {key for info, _ in self._lossy.values() for key in (*info.drops, *info.missed)}:
             drops[key], missed[key] = self._surely_lost(key)
+        gaps = self._numbers.missing()
+        for key in self._of_parts:
+            missed[key] = min(missed[key], gaps.get(key, 0))
         return _without_zeros(drops), _without_zeros(missed)
 
     def _surely_lost(self, key: str) -> tuple[int, int]:
@@ -63,6 +79,10 @@ class MergedLosses:
         made_up = max(0, self._merged.get((number, key), 0) - self._own.get((number, key), 0))
         dropped, missed = info.drops.get(key, 0), info.missed.get(key, 0)
         return max(0, dropped - made_up), max(0, missed - max(0, made_up - dropped))
+
+
+def _is_part(info: SessionInfo) -> bool:
+    return info.origin.get("by") == "cut"
 
 
 def _span_ns(info: SessionInfo) -> tuple[int, int]:

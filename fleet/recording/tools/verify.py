@@ -8,10 +8,10 @@ from msgspec import Struct, field, to_builtins
 
 from fleet.recording import session_dir, time_spec
 from fleet.recording.reading.mcap_reader import ChannelInfo, Row
-from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema, message_of, number_of
+from fleet.recording.reading.message_decoder import SAME_SCHEMA, MessageDecoder, compare_schema, message_of
 from fleet.recording.reading.session import Session
-from fleet.recording.sequence_tracker import PublisherSequence
 from fleet.recording.tools.merge_cut_recover import lost_words
+from fleet.recording.tools.number_gaps import NumberGaps
 from schemas import keys
 from schemas.local_time import exact
 from schemas.printable import printable
@@ -153,13 +153,13 @@ class _Verifier:
     def __init__(self, verdict: SessionVerdict) -> None:
         self._verdict = verdict
         self._decoder = MessageDecoder()
-        self._streams: dict[tuple[str, str], PublisherSequence] = {}
+        self._numbers = NumberGaps()
         self._times: dict[tuple[str, str], int] = {}
         self._channels: dict[int, tuple[ChannelInfo, type[Message] | None, str]] = {}
         self._last_ns: int | None = None
 
     def add(self, row: Row) -> None:
-        info, sequence, log_ns, publish_ns, data = row
+        info, _, log_ns, publish_ns, data = row
         verdict = self._verdict
         known = self._channels.get(id(info))
         if known is None:
@@ -168,21 +168,10 @@ class _Verifier:
         key = info.channel.topic
         verdict.messages += 1
         self._recorder_clock(log_ns)
-        number, publisher, own = sequence, "", False
-        if message_class is not None:
-            message: Any = self._decoder.message(info, data)
-            if message is None:
-                verdict.undecoded[key] = verdict.undecoded.get(key, 0) + 1
-            else:
-                publisher = str(getattr(message, "boot_id", "") or getattr(message, "sender", ""))
-                if getattr(message, "boot_id", "") and (own_number := number_of(message)):
-                    number, own = own_number, True
-        newest = True
-        if number:
-            stream = self._streams.get((key, publisher))
-            if stream is None:
-                stream = self._streams[key, publisher] = PublisherSequence(restarts=not own)
-            newest = stream.add(number, log_ns, publish_ns)
+        message = self._decoder.message(info, data) if message_class is not None else None
+        if message_class is not None and message is None:
+            verdict.undecoded[key] = verdict.undecoded.get(key, 0) + 1
+        publisher, newest = self._numbers.add_decoded(row, message)
         self._publisher_clock(owner, (key, publisher), log_ns, publish_ns, newest=newest)
 
     def _check_schema(self, info: ChannelInfo) -> type[Message] | None:
@@ -219,7 +208,7 @@ class _Verifier:
             self._times[stream] = publish_ns
 
     def end(self) -> None:
-        for (key, publisher), stream in sorted(self._streams.items()):
+        for (key, publisher), stream in sorted(self._numbers.streams.items()):
             about = {"key": key, "publisher": publisher}
             self._verdict.missing += [{**about, "count": gap.count, **to_builtins(gap)} for gap in stream.gaps]
             if stream.unlisted:

@@ -16,6 +16,8 @@ from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import EVERYTHING, Selection
 from fleet.recording.tools.merge_cut_recover import Exists, cut, merge
+from fleet.recording.tools.summary import SessionState, of_session
+from fleet.recording.tools.verify import verify
 from tests.fleet.replay.make_session import make
 
 
@@ -148,6 +150,28 @@ def test_part_has_only_losses_that_may_be_in_it(whole: Session, tmp_path: Path) 
     found = [session_dir.SessionInfo.read(tmp_path / name) for name in ("time", "car")]
     of_red = {"fleet/red/sensor/line": 2}
     assert [each and (each.missed, each.drops) for each in found] == [({}, {}), (of_red, of_red)]
+
+
+def test_part_counts_the_messages_that_a_backfill_brought_after_it(whole: Session, tmp_path: Path) -> None:
+    """`fleet sessions` called such a part whole, and `fleet sessions verify` listed what it lacks."""
+    rows = sorted(whole.rows(), key=lambda row: row[2])
+    key = rows[len(rows) // 2][0].channel.topic
+    late = [row for row in rows if row[0].channel.topic == key][1:3]
+    end_ns = rows[-1][2] + 1_000_000_000
+    moved = [(info, number, end_ns, publish_ns, data) for info, number, _, publish_ns, data in late]
+    session = part_of(whole, tmp_path / "a", [*(row for row in rows if row not in late), *moved])
+    assert session.description is not None
+    session.description.recovered = {key: 2}
+    bounds = (None, end_ns), (end_ns, None)
+    parts = []
+    for name, (start, end) in zip(("first", "second"), bounds, strict=True):
+        cut(session, tmp_path / name, Selection(None, start, end))
+        parts.append(Session(tmp_path / name))
+    found = [(of_session(each).state, verify(each).missing_count, verify(each).missed) for each in parts]
+    assert found == [(SessionState.GAPS, 2, {key: 2}), (SessionState.WHOLE, 0, {})]
+    assert [each.description and each.description.recovered for each in parts] == [{}, {}]
+    merge(parts, tmp_path / "both")
+    assert of_session(Session(tmp_path / "both")).state is SessionState.WHOLE
 
 
 def test_sessions_of_two_fleets_are_refused(whole: Session, tmp_path: Path) -> None:
