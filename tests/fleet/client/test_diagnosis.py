@@ -155,8 +155,8 @@ def test_rejected_frame_counts_once() -> None:
     assert found.cause.startswith("10 of 40 frames ")
     assert " truncated. " in found.cause
     few = {"truncated": 9, "flood_bytes": 5000, "raw_not_published": 700, "not_obeyed": 1, "text": 90}
-    found = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few)))
-    assert [each.code for each in found] == ["flood"]
+    others = diagnose(with_states(link=pb.Link(state="online", rx_frames=40, rejects=few)))
+    assert [each.code for each in others] == ["flood"]
     over = pb.Link(state="online", rx_frames=20 * 12 - 5, rejects={"truncated": 12})
     assert [each.code for each in diagnose(with_states(link=over))] == ["damaged_frames"]
     within = pb.Link(state="online", rx_frames=20 * 12 + 1, rejects={"truncated": 12})
