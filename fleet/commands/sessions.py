@@ -136,8 +136,7 @@ def at(time_text: str, directory: Path | None, *, as_json: bool) -> None:
             f"No session ran at {time_text}. `fleet sessions{place}` lists all, with their start."
         )
     _show(ran, as_json=as_json)
-    session = ran[-1].name if directory is None else shlex.quote(ran[-1].path)
-    click.echo(f"Open one at that time: `fleet replay {session} --from '{time_text}'`", err=True)
+    echo_safely(f"Open one at that time: `fleet replay {ran[-1].typed} --from {shlex.quote(time_text)}`", err=True)
 
 
 def _summaries(directory: Path | None) -> list["SessionSummary"]:

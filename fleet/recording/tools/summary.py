@@ -78,6 +78,11 @@ class SessionSummary(Struct):
     start_ns: int = 0
     end_ns: int = 0
 
+    @property
+    def typed(self) -> str:
+        """Return what to type for the session."""
+        return _typed(self.name, Path(self.path))
+
     def to_dict(self) -> dict[str, Any]:
         """Return the fields for JSON."""
         found: dict[str, Any] = to_builtins(self)
@@ -266,9 +271,15 @@ def _recover(session: Session) -> str:
 
 def typed_name(session: Session) -> str:
     """Return what to type for a session: its name, or its path if the name alone does not find it."""
-    found = find_session(session.name)
-    is_named = found.exists() and found.samefile(session.path)
-    return shlex.quote(session.name if is_named else str(session.path))
+    return _typed(session.name, session.path)
+
+
+def _typed(name: str, path: Path) -> str:
+    """Return what to type for a session with this name and path, in quotes where a shell needs them."""
+    found = find_session(name)
+    is_named = found.exists() and found.samefile(path) and not name.startswith("-")
+    text = name if is_named else str(path)
+    return shlex.quote(f"./{text}" if text.startswith("-") else text)
 
 
 def _is_written_lately(session: Session) -> bool:

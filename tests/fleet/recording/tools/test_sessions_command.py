@@ -4,6 +4,7 @@ import csv
 import json
 import random
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -91,6 +92,21 @@ def test_session_list_shows_state_of_each(session: Path) -> None:
     assert "(in sessions)" in nothing.stderr
     root.rename(root.parent / "sessions")
     assert session.name in fleet(cwd=root.parent).stdout
+
+
+@pytest.mark.parametrize("name", ["my lesson", "-v", "$(date); x"])
+def test_proposed_command_opens_a_session_of_any_name(session: Path, name: str) -> None:
+    """The name stood there without quotes, for a shell to carry out what is in it."""
+    root = session.parents[1]
+    session.parent.rename(root / "sessions")
+    (root / "sessions" / session.name).rename(root / "sessions" / name)
+    then = of_iso("2026-09-21T14:13:20Z").split()[1]
+    for directory in ((), (root / "sessions",), ("sessions",)):
+        _, proposed, _ = fleet("at", then, *directory, cwd=root).stderr.splitlines()[-1].split("`")
+        words = shlex.split(proposed)
+        assert words[:2] == ["fleet", "replay"]
+        assert not words[2].startswith("-")
+        assert fleet("info", words[2], cwd=root).stdout.startswith(name)
 
 
 @pytest.mark.parametrize("seed", range(12))
