@@ -145,7 +145,7 @@ def step(plan: Plan, snapshot: FleetSnapshot, memory: PolicyState, now: float) -
         free=free,
         reserved=reserved,
         roles_before=roles_before,
-        failed_modes=frozenset(failed_modes),
+        failed_modes=failed_modes,
         pinned=pinned_roles(plan, rules, subjects),
         in_force=frozenset(plan.roles) if roles_in_force is None else roles_in_force,
         needs=needs,
@@ -216,7 +216,7 @@ def _must_rest(known: CarSnapshot, attempts: ModeAttempts, barrier: Barrier | No
     # A mode command may have been on its way when the plan was stopped. Only the outcome of a later command shows that
     # the earlier one is over.
     was_obeyed = attempts.count > 0 and not known.busy and known.refused is None
-    is_at_rest = known.mode == Mode.MANUAL and known.verdict != Verdict.CONTRADICTED
+    is_at_rest = known.is_in_mode(Mode.MANUAL)
     cannot_be_commanded = barrier is not None  # so nothing shows yet that it is at rest
     return cannot_be_commanded or not (was_obeyed and is_at_rest)
 
@@ -272,7 +272,7 @@ def _is_in_decided_mode(known: CarSnapshot, last: Decision | None) -> bool:
     """Return True if a car is in the mode that was last decided for it, or needs none. False if it was left alone."""
     if last is None or last.kind is DecisionKind.ALONE:  # until this step, the plan could not command this car
         return False
-    return last.mode is None or (known.mode == last.mode and known.verdict != Verdict.CONTRADICTED and not known.busy)
+    return last.mode is None or (known.is_in_mode(last.mode) and not known.busy)
 
 
 # ---------------------------------------------------------------------- roles
@@ -357,7 +357,7 @@ def _command_modes(
         attempts = before.get(car, ModeAttempts(mode))
         if attempts.mode != mode:
             attempts = ModeAttempts(mode)
-        if known.mode == mode and known.verdict != Verdict.CONTRADICTED:
+        if known.is_in_mode(mode):
             # Forget failures only after the mode has lasted. Otherwise a car that leaves its mode again and again would
             # be commanded without a delay each time, and would never be replaced.
             fine_since = now if attempts.fine_since is None else attempts.fine_since
@@ -433,5 +433,4 @@ def _command_blinks(
 
 
 def _obeys_led(known: CarSnapshot) -> bool:
-    is_in_manual = known.mode == Mode.MANUAL and known.verdict != Verdict.CONTRADICTED
-    return is_in_manual and not known.busy and not known.lacks_led
+    return known.is_in_mode(Mode.MANUAL) and not known.busy and not known.lacks_led

@@ -16,7 +16,7 @@ from fleet.policy.min_cost_matching import assign
 from fleet.policy.plan.plan import Plan, Role
 from fleet.policy.snapshot import UNKNOWN_CAR, CarSnapshot, FleetSnapshot
 from schemas.platform_name import kind_of
-from schemas.words import LinkState, Reason, Verdict
+from schemas.words import LinkState, Reason
 
 ROLE_KEPT_S: Final = HYSTERESIS_S
 """Time for which a car that cannot be reached keeps its role. Then another car gets the role."""
@@ -71,7 +71,7 @@ class Candidates(Struct, frozen=True):
     """Cars that cannot be commanded for a moment, each with the role that is reserved for it."""
     roles_before: Mapping[str, str]
     """The role of each car before this step."""
-    failed_modes: frozenset[tuple[str, str]]
+    failed_modes: Container[tuple[str, str]]
     """Cars and the modes that they have lately failed to change to (`state.note_failures`)."""
     pinned: Mapping[str, PinnedRole]
     """The roles that rules pin, by car."""
@@ -102,8 +102,7 @@ class Candidates(Struct, frozen=True):
     def has_failed(self, car: str, role: Role) -> bool:
         """Return True if the car has lately failed to change to the mode of the role, and is not in it now."""
         known = self.snapshot.cars.get(car, UNKNOWN_CAR)
-        is_in_mode = known.mode == role.mode and known.verdict != Verdict.CONTRADICTED
-        return (car, role.mode) in self.failed_modes and not is_in_mode
+        return (car, role.mode) in self.failed_modes and not known.is_in_mode(role.mode)
 
     def _needy(self, car: str, role: Role, known: CarSnapshot) -> Barrier | None:
         if role.needs is None:
@@ -284,7 +283,7 @@ def _costs(candidates: Candidates) -> dict[str, dict[str, int]]:
             elif is_holder:
                 # The loss of a role for all cars counts half, so that its holder may move to a role with a number.
                 cost -= _ROLE_LOSS_COST if role.count is not None else _ROLE_LOSS_COST // 2
-            if known.mode != role.mode or known.verdict == Verdict.CONTRADICTED:
+            if not known.is_in_mode(role.mode):
                 cost += _MODE_CHANGE_COST
             if known.link not in (LinkState.ONLINE, LinkState.QUIET):
                 cost += _LINK_DOUBT_COST

@@ -19,7 +19,7 @@ from schemas import messages, topics
 from schemas.car_profile import CarProfile
 from schemas.commands import Verb
 from schemas.messages import Observation
-from schemas.words import Motors
+from schemas.words import Motors, Verdict
 
 _HEADER: Final = frozenset({"stamp", "car", "seq", "boot_id"})
 
@@ -170,6 +170,10 @@ class CarSnapshot(Struct, frozen=True):
         """Return the last refusal of this mode. None if the car has accepted the mode since."""
         refusals = (self.refused, *self.refused_before)
         return next((each for each in refusals if each is not None and each.mode == mode), None)
+
+    def is_in_mode(self, mode: str) -> bool:
+        """Return True if the car was commanded into this mode last, and its readings do not contradict it."""
+        return self.mode == mode and self.verdict != Verdict.CONTRADICTED
 
     def lacks(self, mode: str) -> bool:
         """Return True if the car's platform does not know this mode, or the fleet file forbids it."""

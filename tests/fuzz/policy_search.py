@@ -82,8 +82,6 @@ class PolicyCar:
     refuses: bool = False
     opening: int = 0
     """Number of the last command. An earlier one is superseded."""
-    happened_at: float = float("-inf")
-    """When something last happened to the car."""
     asked: list[tuple[float, str]] = field(default_factory=list)
     is_lit: bool = False
     light: Observation | None = None
@@ -224,7 +222,7 @@ class PolicyEpisode:
             self._end(car, mode, running, Reason.BATTERY_LOW)
         else:
             car.opening += 1
-            # What the gateway asks of its car now: to rest, before anything else.
+            # The gateway first brings its car to rest.
             if car.seen.mode not in (Mode.MANUAL, ""):
                 self._set(car, mode=Mode.MANUAL, verdict=Verdict.ASSUMED, motors=Motors.STOPPING)
                 self._later(car.stop_s * self.moments.random(), self._open, car, mode, car.opening, running)
@@ -278,7 +276,6 @@ class PolicyEpisode:
             (self._reset, self._reset, self._drop_link, self._kill, self._empty, self._hold, self._drive, self._restart,
              self._lose_hub, self._switch_lamp, self._switch_lamp)
         )  # fmt: skip
-        car.happened_at = self.now
         what(car)
 
     def _reset(self, car: PolicyCar) -> None:
@@ -297,7 +294,7 @@ class PolicyEpisode:
     def _restore_link(self, car: PolicyCar) -> None:
         car.cut -= 1
         if not car.gone:
-            self._happen(car)
+            self._happen()
             self._set(car, link=LinkState.ONLINE)
             self._recover(car)
 
@@ -311,7 +308,7 @@ class PolicyEpisode:
     def _return(self, car: PolicyCar) -> None:
         car.down -= 1
         if not car.down:
-            self._happen(car)
+            self._happen()
             self._appear(car)
 
     def _empty(self, car: PolicyCar) -> None:
@@ -321,27 +318,27 @@ class PolicyEpisode:
 
     def _charge(self, car: PolicyCar) -> None:
         car.refuses = False
-        self._happen(car)
+        self._happen()
 
     def _hold(self, car: PolicyCar) -> None:
         """Let a person stop the car, and resume it later."""
         if not car.gone and car.seen.present:
-            car.opening += 1
-            car.mode = Mode.MANUAL
-            self._set(car, mode=Mode.MANUAL, verdict=Verdict.CONFIRMED, motors=Motors.OFF, held_by="person.ann")
-            self._later(self.moments.uniform(1.0, 20.0), self._release, car)
+            self._take(car, self.moments.uniform(1.0, 20.0), held_by="person.ann")
 
     def _drive(self, car: PolicyCar) -> None:
         """Let a person drive the car for a moment."""
         if not car.gone and car.seen.present and not car.seen.taken_by:
-            car.opening += 1
-            car.mode = Mode.MANUAL
-            self._set(car, mode=Mode.MANUAL, verdict=Verdict.CONFIRMED, motors=Motors.OFF, driven_by="person.bob")
-            self._later(self.moments.uniform(0.5, 8.0), self._release, car)
+            self._take(car, self.moments.uniform(0.5, 8.0), driven_by="person.bob")
+
+    def _take(self, car: PolicyCar, seconds: float, **by: str) -> None:
+        car.opening += 1
+        car.mode = Mode.MANUAL
+        self._set(car, mode=Mode.MANUAL, verdict=Verdict.CONFIRMED, motors=Motors.OFF, **by)
+        self._later(seconds, self._release, car)
 
     def _release(self, car: PolicyCar) -> None:
         self._set(car, held_by=None, driven_by=None)
-        self._happen(car)
+        self._happen()
 
     def _switch_lamp(self, _: PolicyCar) -> None:
         self.cars["red"].is_lit = not self.cars["red"].is_lit
@@ -375,8 +372,8 @@ class PolicyEpisode:
         if not car.down:  # else it comes back by itself
             car.seen = replace(car.seen, present=True)
 
-    def _happen(self, car: PolicyCar) -> None:
-        self._happened_at = car.happened_at = self.now
+    def _happen(self) -> None:
+        self._happened_at = self.now
 
     # ------------------------------------------------------------------ the judge
 
