@@ -5,6 +5,7 @@ A stop of several cars is one command with one id, and each gateway publishes se
 
 from typing import Any, Final
 
+from fleet.recording.foreign_fields import text_of
 from schemas.commands import STOPPING_VERBS, Verb
 from schemas.topics import TOPICS
 from schemas.words import Phase, Reason
@@ -20,7 +21,7 @@ def stops_cars(event: Any) -> bool:
     A pause stops no car before its gateway has accepted it, because not everybody may pause a fleet. The message has
     the schema of its recording, which may lack a field, or have it with another type.
     """
-    verb, phase, reason = (str(getattr(event, name, "")) for name in ("verb", "phase", "reason"))
+    verb, phase, reason = (text_of(event, name) for name in ("verb", "phase", "reason"))
     if verb != Verb.PAUSE:
         return verb in STOPPING_VERBS
     return phase != Phase.ASKED and (phase != Phase.REJECTED or reason == Reason.LINK_DOWN)
@@ -37,7 +38,7 @@ class StopCount:
         """Count a message of `EVENTS`. Messages of other types are ignored."""
         if event.DESCRIPTOR.full_name != EVENTS.message or not stops_cars(event):
             return
-        command, phase = (str(getattr(event, name, "")) for name in ("id", "phase"))
+        command, phase = (text_of(event, name) for name in ("id", "phase"))
         if not command:  # without an id, the events of one command cannot be told from others: count each car
             self.count += phase == Phase.ASKED
         elif command not in self._recent:

@@ -89,12 +89,6 @@ def _field_shapes(descriptor: Any, prefix: str = "", above: frozenset[str] = fro
     return found
 
 
-def number_of(message: Any) -> int:
-    """Return the number that a publisher gave a message. 0 if its schema has no such number."""
-    number = getattr(message, "seq", 0)
-    return number if isinstance(number, int) else 0
-
-
 def message_of(info: ChannelInfo) -> str:
     """Return the full protobuf name of the messages of a channel, or an empty text if the file has no schema for it."""
     return info.schema.name if info.schema is not None and info.schema.encoding == "protobuf" else ""

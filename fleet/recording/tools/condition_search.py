@@ -14,9 +14,10 @@ from fleet.conditions import Expression
 from fleet.conditions.holding import HeldSpan
 from fleet.policy.car_condition import CarCondition
 from fleet.policy.snapshot import is_in, topic_of
+from fleet.recording.foreign_fields import number_of, text_of
 from fleet.recording.left_out import LeftOut, LeftOutCause
 from fleet.recording.reading.mcap_reader import ChannelInfo
-from fleet.recording.reading.message_decoder import MessageDecoder, number_of, why_not_decoded
+from fleet.recording.reading.message_decoder import MessageDecoder, why_not_decoded
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import Selection
 from fleet.recording.tools.car_timeline import message_time_ns
@@ -70,10 +71,10 @@ class ConditionRun:
     def add(self, topic: str, message: Any, at_ns: int, ahead_ns: int = 0) -> None:
         """Use a message. `at_ns` is its stamp. The recorder's clock was ahead of that stamp by `ahead_ns`."""
         # The message has the schema of the recording, which may lack a field.
-        if topic == COMMANDS.name and getattr(message, "phase", "") == Phase.SENT:
+        if topic == COMMANDS.name and text_of(message, "phase") == Phase.SENT:
             self._command = asked_by(message)
         if topic == MODE.name:
-            self._mode = str(getattr(message, "asked", ""))
+            self._mode = text_of(message, "asked")
         if topic not in self._condition.topics or (step := self._condition.add(topic, message, at_ns)) is None:
             return
         self._keep(step.ended)
@@ -149,9 +150,9 @@ def _messages(
             if key.topic in names:
                 left_out.add(info.channel.topic, cause)
             continue
-        stream = info.channel.topic, str(getattr(message, "boot_id", ""))
+        stream = info.channel.topic, text_of(message, "boot_id")
         at_ns = message_time_ns(message, publish_ns)
-        yield key.car, RecordedMessage(log_ns, at_ns, stream, number_of(message), (key.topic, message))
+        yield key.car, RecordedMessage(log_ns, at_ns, stream, number_of(message, "seq"), (key.topic, message))
 
 
 def _why_left_out(

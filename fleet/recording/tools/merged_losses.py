@@ -28,9 +28,9 @@ class MergedLosses:
             if info is not None and (info.drops or info.missed)
         }
         infos = [info for info, _ in self._lossy.values()]
-        self._of_parts = {key for info in infos if _is_part(info) for key in info.missed} - {
-            key for info in infos for key in (*info.drops, *(() if _is_part(info) else info.missed))
-        }
+        of_parts = {key for info in infos if _is_part(info) for key in info.missed}
+        of_others = {key for info in infos for key in (*info.drops, *(() if _is_part(info) else info.missed))}
+        self._of_parts = of_parts - of_others
         """Keys of which only parts miss messages. These may be in another part of the same session."""
         self._numbers = NumberGaps()
         """The numbers of these keys in the merged session."""

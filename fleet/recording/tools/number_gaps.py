@@ -4,8 +4,9 @@ from collections.abc import Mapping
 
 from google.protobuf.message import Message
 
+from fleet.recording.foreign_fields import number_of, text_of
 from fleet.recording.reading.mcap_reader import Row
-from fleet.recording.reading.message_decoder import MessageDecoder, number_of
+from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.sequence_tracker import PublisherSequence
 
 
@@ -31,9 +32,9 @@ class NumberGaps:
         `message` is None if it cannot be decoded.
         """
         info, sequence, log_ns, publish_ns, _ = row
-        boot = str(getattr(message, "boot_id", ""))
-        publisher = boot or str(getattr(message, "sender", ""))
-        own = number_of(message) if boot else 0
+        boot = text_of(message, "boot_id")
+        publisher = boot or text_of(message, "sender")
+        own = number_of(message, "seq") if boot else 0
         if not (number := own or sequence):
             return publisher, True
         stream = self.streams.get((info.channel.topic, publisher))

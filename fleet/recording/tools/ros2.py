@@ -20,6 +20,7 @@ from typing import Any, Final
 from google.protobuf.message import Message
 from msgspec import Struct, field
 
+from fleet.recording.foreign_fields import text_of
 from fleet.recording.left_out import LeftOut
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.reading.message_decoder import MessageDecoder, why_not_decoded
@@ -235,7 +236,7 @@ def _diagnostics(message: Message, header: Any, key: str) -> Any:
         level=0,  # OK: a record judges nothing
         name=key,
         message="",
-        hardware_id=str(getattr(message, "car", "")),
+        hardware_id=text_of(message, "car"),
         values=values,
     )
     return _ros(DIAGNOSTICS, header=header, status=[status])
@@ -289,7 +290,7 @@ def write_bag(rows: Iterable[Row], out: Path) -> Bag:
 def _convert(message: Message, key: str, publish_ns: int) -> tuple[str, Any]:
     """Return the ROS type and the serialized message."""
     kind, convert = _CONVERTERS.get(message.DESCRIPTOR.full_name, (DIAGNOSTICS, None))
-    if convert is not None:
+    if convert is not None:  # it may change the header that it gets
         try:
             return kind, _STORE.serialize_cdr(convert(message, _header(message, key, publish_ns)), kind)
         except _UNFIT:

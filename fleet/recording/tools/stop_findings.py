@@ -12,6 +12,7 @@ from typing import Any, Final
 from msgspec import Struct, field
 
 from fleet.client.claims import claims_of
+from fleet.recording.foreign_fields import text_of
 from fleet.recording.stop_count import stops_cars
 from schemas.keys import name_of
 from schemas.local_time import clock
@@ -118,7 +119,7 @@ def failed_stop_code(topic: str, message: Any) -> str:
 
 def asked_by(event: Any) -> str:
     """Return verb and person of a fleet.v1.CommandEvent: `stop by mia`. The schema of its recording may lack both."""
-    verb, sender = (str(getattr(event, name, "")) for name in ("verb", "sender"))
+    verb, sender = (text_of(event, name) for name in ("verb", "sender"))
     return f"{verb or 'a command'} by {name_of(sender) or 'somebody'}"
 
 

@@ -14,6 +14,7 @@ from typing import Any, Final
 from msgspec import Struct, field, to_builtins
 
 from fleet.recording import session_dir, time_spec
+from fleet.recording.foreign_fields import text_of
 from fleet.recording.reading.message_decoder import MessageDecoder
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import Selection
@@ -220,7 +221,7 @@ def marks_of(session: Session, about: SessionSummary) -> list[Mapping[str, Any]]
         return list(about.marks)
     found: list[Mapping[str, Any]] = list(about.marks)
     for log_ns, message in _messages(session, about, MARK_TOPIC_NAME):
-        text, by = (str(getattr(message, name, "")) for name in ("message", "name"))
+        text, by = (text_of(message, name) for name in ("message", "name"))
         found.append({"time": time_spec.iso(log_ns), "text": text, "by": by})
     return found
 

@@ -51,7 +51,7 @@ Change = Callable[[FieldDescriptorProto], bool]
 
 
 def changed(name: str, change: Change, part: int) -> FileDescriptorSet:
-    """Return the schema of a message, of which every third field is changed."""
+    """Return the schema of a message, with every third field changed."""
     files = FileDescriptorSet.FromString(messages.descriptor_set(name))
     for message in (each for file in files.file if file.package == "fleet.v1" for each in file.message_type):
         fields = [each for number, each in enumerate(message.field) if number % PARTS != part or change(each)]
