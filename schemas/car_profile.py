@@ -57,7 +57,7 @@ class CarProfile(Protocol):
 
     @property
     def not_observed(self) -> tuple[str, ...]:
-        """What is said of such cars but was only read somewhere or assumed, as sentences. Empty if there is nothing."""
+        """Sentences about such cars that somebody has read or assumed, and nobody has observed. Empty without any."""
 
     @property
     def has_network(self) -> bool:

@@ -225,10 +225,10 @@ class CarState(Struct):
 
     @property
     def is_silent(self) -> bool:
-        """True if the link is open, and the car is silent for longer than is normal for it."""
+        """True if the link is open, and the car sends nothing for longer than is normal for it."""
         if self.link.state == LinkState.QUIET:
             return bool(self.safety.trust == CarTrust.UNHEARD)
-        return bool(self.link.state == LinkState.STALE)
+        return bool(self.link.state == LinkState.STALE) and not self.is_unreadable
 
     @property
     def is_unreadable(self) -> bool:

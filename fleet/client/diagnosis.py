@@ -213,12 +213,12 @@ def _unreadable(e: CarEvidence) -> str:
 
 
 def _silent_fan(e: CarEvidence) -> str:
-    silent_by_fan = e.state.is_silent and e.state.motion.fan and not e.state.is_unreadable
+    silent_by_fan = e.state.is_silent and e.state.motion.fan
     return "The car is silent, and its fan runs: some cars send nothing while the fan runs." if silent_by_fan else ""
 
 
 def _silent_car(e: CarEvidence) -> str:
-    if not e.state.is_silent or e.state.is_unreadable or e.state.motion.fan or _baud(e):
+    if not e.state.is_silent or e.state.motion.fan or _baud(e):
         return ""
     last_rx_s = e.state.last_rx_s
     since = "since its link opened" if last_rx_s is None else f"for {last_rx_s:.0f} s"
