@@ -273,6 +273,8 @@ class Fleet:
 
         watch = Watch(accept).begin(subscribe)
         self._watches.add(watch)
+        if self._closed:  # since `check_open`: perhaps `close` has not seen this watch
+            watch.close()
         return watch
 
     def wait(self, expression: str, when: str, *, timeout_s: float | None = None, for_s: float = 0.0) -> Reading:
@@ -335,7 +337,8 @@ class Fleet:
                 topic = topics.TOPICS["sensor/pose"]
                 self._poses[car] = self.bus.publisher(keys.topic_key(self.name, car, topic.name), topic, car)
             when = datetime.now(UTC) if at is None else at
-            self._poses[car].put(message, round(when.timestamp() * 1e6) * 1000)
+            with self.bus.while_open():
+                self._poses[car].put(message, round(when.timestamp() * 1e6) * 1000)
 
     # ------------------------------------------------------------------ commands
 
@@ -401,9 +404,13 @@ class Fleet:
             if command.is_stop:
                 with suppress(RuntimeError):  # the fleet was closed meanwhile, which ends the command
                     pool.submit(self._query_supervisor, command)
-        except BaseException:
+        except BaseException as error:
             del self._pending[command_id]
+            if self._closed and isinstance(error, RuntimeError):  # of a pool that takes no more jobs
+                raise closed_error() from error
             raise
+        if self._closed:  # since `check_open`: perhaps `close` has not seen this command
+            command.abandon()
         return command
 
     def outcomes(self, command: PendingCommand) -> list[Outcome]:

@@ -10,7 +10,7 @@ import os
 import threading
 import warnings
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from math import inf
 from time import monotonic
 from typing import Any, Final, Self
@@ -202,8 +202,18 @@ class Bus:
         self._keep(declared, self._on_a_daemon)
         return declared
 
+    @contextmanager
+    def while_open(self) -> Iterator[None]:
+        """Raise BusError instead of Zenoh's error if another thread closes the session during this block."""
+        try:
+            yield
+        except zenoh.ZError as error:
+            if not self._closing.is_set():
+                raise
+            raise BusError(f"the session at {self.endpoint} was closed meanwhile") from error
+
     def _keep(self, declared: Declared, declare: Callable[[Declared], None]) -> None:
-        with self._changing:
+        with self._changing, self.while_open():
             self._declarations = [each for each in self._declarations if not each.is_over]
             declare(declared)
             self._declarations.append(declared)
@@ -310,7 +320,7 @@ class Bus:
 
     def publisher(self, key: str, topic: Topic, source: str) -> Publisher:
         """Declare a publisher of `topic` under `key`. `source` is the `car` of its messages."""
-        with self._changing:
+        with self._changing, self.while_open():
             made = Publisher(self._declaring, key, topic, source, self.boot_id)
             self._publishers.append(made)
         return made
@@ -414,7 +424,8 @@ class Bus:
             if not link and monotonic() < link_end:
                 self._closing.wait(_LINK_POLL_S)
                 continue
-            replies = self._session.liveliness().get(expression, timeout=max(end - asked_at, _LINK_POLL_S))
+            with self.while_open():
+                replies = self._session.liveliness().get(expression, timeout=max(end - asked_at, _LINK_POLL_S))
             found = watched | {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
             self._asked_over = link
             now = monotonic()
@@ -466,16 +477,17 @@ class Bus:
         qos: Qos = Qos.COMMAND,
     ) -> Iterator[Sample | Failure]:
         """Send a query to everyone, and yield the answers as they arrive. A timeout yields a Failure."""
-        replies = self._session.get(
-            selector,
-            zenoh.handlers.FifoChannel(_MAX_QUEUED_ANSWERS),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout_s,
-            payload=payload,
-            encoding=encoding,
-            **ZENOH_QOS[qos],
-        )
+        with self.while_open():
+            replies = self._session.get(
+                selector,
+                zenoh.handlers.FifoChannel(_MAX_QUEUED_ANSWERS),
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+                payload=payload,
+                encoding=encoding,
+                **ZENOH_QOS[qos],
+            )
         for reply in replies:
             if reply.ok is not None:
                 yield sample_of(reply.ok)

@@ -15,7 +15,7 @@ from typing import Any, Final
 import zenoh
 
 from schemas import keys
-from schemas.bus import Bus, messages_of
+from schemas.bus import Bus, BusError, messages_of
 from schemas.topics import TOPICS
 
 STATUS_TOPIC: Final = TOPICS["@recorder/status"]
@@ -97,7 +97,7 @@ class RecorderService:
 
     def wait_for_hub(self, timeout_s: float = 5.0) -> None:
         """Send the hub a query and wait for the answer. The hub then has everything that was sent before."""
-        with contextlib.suppress(zenoh.ZError):  # if the bus is gone, there is nothing to wait for
+        with contextlib.suppress(zenoh.ZError, BusError):  # if the bus is gone, there is nothing to wait for
             self._bus.tokens(self._token, timeout_s)
 
     @property

@@ -5,6 +5,7 @@ import math
 import threading
 import time
 from collections.abc import Awaitable, Callable, Iterator
+from contextlib import suppress
 from datetime import UTC, datetime
 from decimal import Decimal
 from fractions import Fraction
@@ -16,6 +17,7 @@ import zenoh
 from fleet.aio import Fleet as AsyncFleet
 from fleet.client.client import Fleet
 from fleet.client.commands import led_request, pause_request
+from fleet.client.job_threads import JobThreads
 from fleet.client.outcome import Outcome
 from schemas import keys, messages, topics
 from schemas.bus import BadEndpoint, Bus, BusError, NoFleet, reply
@@ -498,6 +500,27 @@ def test_closed_fleet_raises_bus_error(cars: Cars) -> None:
     for use in uses:
         with pytest.raises(BusError, match="is closed"):
             use()
+
+
+def test_use_that_began_before_the_fleet_was_closed_ends(cars: Cars, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = Fleet(cars.endpoint, sender="ann")
+    monkeypatch.setattr(client, "check_open", lambda: None)  # as if another thread closed it right after this check
+    client.close()
+    uses: list[Callable[[], object]] = [
+        client.stop,
+        client.car("red").lease().__enter__,
+        lambda: client.get("red"),
+        lambda: client.watch("red/sensor/range"),
+        lambda: client.publish_pose("red", x_m=0.0, y_m=0.0, heading_rad=0.0),
+    ]
+    for use in uses:
+        with pytest.raises(BusError, match="closed"):
+            use()
+    monkeypatch.setattr(client, "_stop_pool", JobThreads(2, "still-open"))  # and before its pools were closed
+    began = time.monotonic()
+    with suppress(BusError):  # or its outcome is unknown
+        client.stop(["red"])
+    assert time.monotonic() - began < 10.0, "a stop waits for a lost bus for 30 s, and this bus is closed"
 
 
 async def test_closed_async_fleet_raises_bus_error(cars: Cars) -> None:
