@@ -181,7 +181,8 @@ class CarView:
         # A growing number that nobody needs would make the page draw the card again each second.
         is_calm = claim.past is not None or claim.what == LinkState.ONLINE
         since_s = 0 if is_calm else int(claim.since_s or 0)
-        return {"link": {"state": claim.what, "reason": claim.why, "since_s": since_s}}
+        state = "unreadable" if self.state.is_unreadable else claim.what
+        return {"link": {"state": state, "reason": claim.why, "since_s": since_s}}
 
     def _mode(self, now: float) -> dict[str, Any]:
         claim = self.state.claims(now).mode

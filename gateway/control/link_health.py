@@ -88,7 +88,7 @@ class LinkHealth(Struct):
         if is_heard and has_reading and silence_s <= (limit_s if limit_s is not None else STALE_S):
             self._set(LinkState.ONLINE, "readings arrive", now)
         elif not is_heard:
-            self._set(LinkState.STALE, f"silent for {silence_s:.1f} s: it may be moving", now)
+            self._set(LinkState.STALE, f"no reading for {silence_s:.1f} s: it may be moving", now)
         elif limit_s is None:
             self._set(LinkState.QUIET, why_quiet, now)
         elif min(silence_s, unheard_s) <= limit_s:

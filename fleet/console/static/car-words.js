@@ -16,6 +16,9 @@ export const isLost = (car) => !car.gateway || car.link.state === "lost";
 // Somebody has stopped the car, and nothing shows yet that it stands.
 export const isUnconfirmed = (car) => !isLost(car) && (car.hold !== null || car.estops.length > 0) && !["off", "stopping"].includes(car.motors.state);
 
+// The link is open, but no reading comes over it.
+export const isUnheard = (car) => car.link.state === "stale" || car.link.state === "unreadable";
+
 // How long nothing new has come of a car, s. 0 while news come.
 export const silence = (car) => (car.silent_s ?? 0) + unheard_s();
 
@@ -38,7 +41,7 @@ function findTroubles(car) {
     isLost(car) && ["bad", "lost", lost_s],
     car.estops.length > 0 && ["bad", "estopped"],
     silent_s > 0 && !isLost(car) && ["warn", "old", silent_s],
-    car.gateway && car.link.state === "stale" && !isUnconfirmed(car) && ["warn", "stale", car.link.since_s],
+    car.gateway && isUnheard(car) && !isUnconfirmed(car) && ["warn", car.link.state, car.link.since_s],
     car.battery?.level === "critical" && ["bad", "battery"],
   ]
     .filter(Boolean)

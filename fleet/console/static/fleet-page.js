@@ -3,7 +3,7 @@
 // No tile ever moves: a press must not meet another car than the one that the eye has chosen. So each tile has one
 // size whatever is in it, and what comes and goes (trouble, all about a car) has a place of its own.
 
-import { directionOf, driverOf, isLost, isMoving, isUnconfirmed, modeWords, motorName, silence, troublesOf } from "./car-words.js";
+import { directionOf, driverOf, isLost, isMoving, isUnconfirmed, isUnheard, modeWords, motorName, silence, troublesOf } from "./car-words.js";
 import { carSets, changed, clock, command, isRefused, refusals, select, store, unheard_s, who } from "./console.js";
 import { arrows, links, motions, motors, t, tileMotors, trends, verdicts } from "./texts.js";
 import { Battery, html, Memo, Rail, Refused, Results, SetChips, useState, Verdict } from "./ui.js";
@@ -27,7 +27,7 @@ function Trouble({ car }) {
     return html`<${Alarm} words=${t.lost(car.name, ago, words)} todo=${`${car.link.reason} ${t.lostDo}`} />`;
   }
   return html`${isUnconfirmed(car) && html`<${Alarm} words=${t.unconfirmed(car.name)} todo=${t.unconfirmedDo} />`}
-    ${car.link.state === "stale" && html`<${Alarm} words=${t.stale(car.name, ago)} todo=${t.staleDo} />`}`;
+    ${isUnheard(car) && html`<${Alarm} words=${t[car.link.state](car.name, ago)} todo=${t[`${car.link.state}Do`]} />`}`;
 }
 
 function Estops({ car }) {

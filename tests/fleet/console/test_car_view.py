@@ -70,6 +70,14 @@ def test_gone_gateway_has_duration_and_past_claims() -> None:
     assert (car["mode"]["asked"], car["mode"]["verdict"]) == ("unknown", "assumed")
 
 
+@pytest.mark.parametrize(("last_rx_s", "state"), [(0.5, "unreadable"), (60.0, "stale"), (None, "stale")])
+def test_car_that_sends_bytes_without_readings_is_not_silent(last_rx_s: float | None, state: str) -> None:
+    view = view_of()
+    view.on_presence(["red"], 10.0)
+    view.on_message("red", "state/link", pb.Link(state="stale", since_s=60.0, last_rx_s=last_rx_s), 10.0)
+    assert view.as_list(10.5)[0]["link"]["state"] == state
+
+
 def test_link_without_gateway_is_not_online() -> None:
     view = view_of()
     view.on_presence(["red"], 10.0)

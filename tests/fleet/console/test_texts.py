@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from fleet.console import server
-from schemas.words import MODE_TEXTS, Mode, Motion
+from schemas.words import MODE_TEXTS, LinkState, Mode, Motion
 
 TEXTS = Path(server.__file__).parent / "static" / "texts.js"
 
@@ -23,3 +23,7 @@ def test_texts_name_every_motion_and_unknown() -> None:
 def test_each_mode_has_title_and_sentence() -> None:
     assert set(MODE_TEXTS) == set(Mode)
     assert all(name and words.endswith(".") for name, words in MODE_TEXTS.values())
+
+
+def test_texts_name_every_state_of_a_link() -> None:
+    assert keys_of("links") == {*LinkState, "unreadable", "unknown"}

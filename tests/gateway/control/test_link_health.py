@@ -75,7 +75,7 @@ def test_link_of_unheard_car_is_not_online(limit_s: float | None) -> None:
     health.on_open(1.0)
     health.on_reading(2.0)
     assert judged(health, 2.5, limit_s=limit_s, is_heard=False) is LinkState.STALE
-    assert health.reason == "silent for 0.5 s: it may be moving"
+    assert health.reason == "no reading for 0.5 s: it may be moving"
     assert judged(health, 2.6, limit_s=limit_s) is LinkState.ONLINE
 
 
@@ -85,7 +85,7 @@ def test_no_time_is_negative() -> None:
     health.on_open(1.0)
     health.on_reading(7.0)
     judged(health, 2.0, is_heard=False)
-    assert health.reason.startswith("silent for 0.0 s")
+    assert health.reason.startswith("no reading for 0.0 s")
 
 
 def test_counters() -> None:
