@@ -156,8 +156,8 @@ class UseEpisode:
         running, pacing = control.driver.stops.running, control.driver.model.pacing
         if running is not None and sum(at > running.began_at for at in self._lit_at) >= FREE_ACTIONS:
             return LONGEST_STOP_S  # a stream of actions waits for the stop
-        if not self._has_echo and pacing.written_at in self._lit_at:
-            return min(pacing.buffer_until - now, REPEAT_INTERVAL_S)  # until the car has read the last one
+        if not self._has_echo:
+            return min(pacing.buffer_until - now, REPEAT_INTERVAL_S)  # until the car has read the last frame
         return 0.0
 
     @property

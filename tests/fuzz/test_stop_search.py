@@ -121,6 +121,14 @@ FOUND = (
         again_s=4.527784239525141, driven=True, stream_s=0.11370913327476209,
         traits=CarTraits(interval_s=1.493, spread_s=0.0, close_s=0.0, silent_modes=frozenset({Mode.LIGHT_SEEKING})),
     ),
+    # The car stood. It read a renewed stop while the whistle behind it arrived, and took the rest of that for a motion.
+    EpisodePlan(
+        513721, "arduino", "arduino", "no-echo", "acts", 0.7826454561413663, Ending.MANUAL, (),
+        kept=True, stream_s=0.42302983141327405,
+        traits=CarTraits(
+            interval_s=0.6999929943024791, spread_s=0.001, close_s=0.0, silent_modes=frozenset({Mode.LIGHT_SEEKING})
+        ),
+    ),
 )  # fmt: skip
 
 

@@ -57,8 +57,10 @@ class StopRenewal:
         if self._general_stop_follows:
             return self._model.pacing.written_at + REPEAT_INTERVAL_S
         # `MODE00` must not reach the car together with a servo frame before it. The car would read both as one string,
-        # take the digits of the servo frame for those of the mode, and open a mode.
-        return max(self._next_at, self._model.pacing.ready_at(Gate.ALONE)) if self._clears else self._next_at
+        # take the digits of the servo frame for those of the mode, and open a mode. And without an echo the car may
+        # read the frame before while this one arrives: it would take the rest of this one for a motion.
+        is_alone = self._clears or self._model.is_without_echo
+        return max(self._next_at, self._model.pacing.ready_at(Gate.ALONE)) if is_alone else self._next_at
 
     @property
     def goes_first_at(self) -> float:

@@ -2,11 +2,12 @@
 
 import pytest
 
-from gateway.control.commands import Action, AimServo, ChangeSpeed, Drive, Led, MoveServo, SetMode
+from gateway.control.commands import Action, AimServo, ChangeSpeed, Drive, Led, MoveServo, SetLight, SetMode, Stop
 from gateway.drivers.yahboom.estimate.outputs import StateEstimate
-from gateway.drivers.yahboom.protocol.frames import General, ModeOpen
+from gateway.drivers.yahboom.protocol.frames import General, ModeOpen, encode
 from gateway.drivers.yahboom.protocol.platforms import SPEEDS, parse_platform
-from schemas.words import Mode, Motion, Platform, ServoAction, SpeedStep
+from gateway.sim.model.world import World
+from schemas.words import Light, Mode, Motion, Platform, ServoAction, SpeedStep
 from tests.support.controls import control
 from tests.support.truth import near_walls
 from tests.support.virtual import Pair
@@ -128,3 +129,19 @@ def test_no_angle_is_claimed_after_the_car_was_out_of_reach() -> None:
     pair.run(1.0, linked=False)
     pair.ready()
     assert pair.control.driver.model.outputs.servo_deg is None, "it may have been switched off, or be another car"
+
+
+@pytest.mark.parametrize("asked_s", [-0.05, 0.001])
+def test_renewed_stop_and_action_wait_for_each_other_without_an_echo(asked_s: float) -> None:
+    """Without an echo the car reads rarely, and may take half of a frame behind an unread one for a motion."""
+    pair = Pair(world=World.open_field(), start_s=2.0)
+    pair.connect()
+    pair.run(40.0)
+    pair.ask(Stop(), verb="stop")
+    pair.run(30.0)
+    pair.run(pair.control.driver.stops.renewal.due_at + asked_s - pair.now)
+    pair.ask(SetLight(Light.RED))
+    pair.run(2.0)
+    (first_at, first), (then_at, then) = pair.sent[-2:]
+    assert {first, then} == {encode(General(Motion.STOP)), encode(General(Motion.STOP, light=Light.RED))}
+    assert then_at - first_at > 0.5, "a ranging without an echo takes 1.0 s"
