@@ -161,7 +161,7 @@ class Progress:
 
     @property
     def _joined(self) -> bool:
-        """True if the command extends a running drive. Then no event of this command says when the drive ends.
+        """True if the command extends a running drive. An older gateway sends no event when that drive ends.
 
         A drive that begins is queued before it is sent. An extension is sent without being queued.
         """
@@ -178,7 +178,7 @@ class Progress:
         if not self.answered:
             return self._asked_at + OVERLOAD_ANSWER_TIMEOUT_S + OUTCOME_MARGIN_S
         if self._joined:
-            return self._timeout_from + self._duration_s
+            return self._timeout_from + self._duration_s + OUTCOME_MARGIN_S
         wait_s = {
             Until.SENT: MAX_QUEUE_TIME_S,
             Until.STOPPED: self._worst_case_s + MAX_EVIDENCE_TIMEOUT_S,

@@ -62,10 +62,14 @@ _STOP_FAILURES: Final = {
 }
 """Text of a stop that failed, by result. The gateway's words begin with the consequence for the car."""
 STOP_VERBS: Final = STOPPING_VERBS | {RELEASE, ESTOP_FLEET}
+_MAY_NEED_NO_FRAME: Final = frozenset((Verb.MODE, Verb.FAN))
+"""Verbs for which nothing may have to be sent, as for the mode that the car is in. Only then do gateways add words."""
 
 
 def describe(verb: str, results: tuple[str, ...], *, car: str, detail: str, words: str, took_s: float) -> str:
     """Describe what a command did. `results` are ordered, the most specific first, such as reason and phase."""
+    if words and verb in _MAY_NEED_NO_FRAME and results[0] == Phase.SENT:
+        return words
     tables = [EFFECTS.get(verb, {}), *([_STOP_FAILURES] if verb in STOP_VERBS else ()), EFFECTS[_ANY]]
     template = next((table[result] for result in results for table in tables if result in table), "{words}")
     shown = f" {detail}" if detail else ""

@@ -89,7 +89,9 @@ class CommandQueue(Struct):
         """
         words = f"the car was busy for {MAX_QUEUE_TIME_S:g} s"
         for pending in [each for each in self.one_shots if now >= each.waits_since + MAX_QUEUE_TIME_S]:
-            self._end_part(pending, Phase.EXPIRED, Reason.EXPIRED, words, now)
+            written, total = pending.frames_written, pending.frames_written + len(pending.frames)
+            begun = f"only {written} of its {total} frames were sent: " if written else ""
+            self._end_part(pending, Phase.EXPIRED, Reason.EXPIRED, f"{begun}{words}", now)
         if self.mode_change is not None and now >= self.mode_change.waits_since + MAX_QUEUE_TIME_S:
             self.close_mode_change(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
@@ -133,6 +135,7 @@ class CommandQueue(Struct):
         An action is recorded as sent at its first frame if there is a delay after that, else at its last frame.
         """
         pending.frames.popleft()
+        pending.frames_written += 1
         pending.begin_delay(now)
         if pending.lasts or not pending.frames:
             self.log.record_sent(pending, now)

@@ -21,6 +21,7 @@ class Pending(Struct):
     received_at: float
     frames: deque[Any] = field(default_factory=deque)
     """The frames that are not written yet. A `Later` is a frame with a delay before it."""
+    frames_written: int = 0
     sent: bool = False
     count: int = 1
     """Number of merged commands."""

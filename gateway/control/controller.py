@@ -38,7 +38,7 @@ from gateway.control.sender_presence import Senders
 from schemas.keys import name_of
 from schemas.limits import MAX_QUEUE_TIME_S
 from schemas.rights import NO_PEOPLE, Authority, Estop, FleetPause, Loan, People, Right, Sender, binding_pause
-from schemas.words import FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
+from schemas.words import Basis, FrameOrigin, Level, Mode, Motion, Phase, Rank, Reason, Verdict
 
 D_co = TypeVar("D_co", bound=Driver, covariant=True)
 
@@ -497,10 +497,10 @@ class Controller(Generic[D_co]):
         else:
             held.expires_at, held.duration_s = self._times(pending, duration_s, now)
         held.pending.count += 1
-        if pending.command.streamed:
+        if pending.command.streamed and (held.pending.command.streamed or not held.pending.sent):
             return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)
         if held.pending.sent:
-            return self._done(pending, f"the running drive was {'shortened' if is_shorter else 'extended'}", now)
+            return self._pass_drive_on(held, pending, "shortened" if is_shorter else "extended", now)
         self._log.record(
             held.pending,
             Phase.SUPERSEDED,
@@ -511,6 +511,19 @@ class Controller(Generic[D_co]):
         pending.count = held.pending.count
         held.pending = pending
         return self._queued(pending, now, self._wait(pending, now))
+
+    def _pass_drive_on(self, held: HeldMotion, pending: Pending, changed: str, now: float) -> Answer:
+        """Let a command take over the drive of which it has changed the end. Whoever waits for the older one is told.
+
+        `changed` is `extended` or `shortened`.
+        """
+        sent_s = now - (now if held.began_at is None else held.began_at)
+        words = f"sent for {sent_s:.1f} s until now; a newer command has {changed} the drive"
+        self._log.record(held.pending, Phase.SENT, now, words=words, basis=Basis.SENT)
+        held.pending = pending
+        words = f"the running drive was {changed}"
+        self._log.record_sent(pending, now, words)
+        return Answer(Phase.SENT, words=words)
 
     def _release(self, pending: Pending, now: float) -> Answer:
         sender = pending.command.sender.text_name

@@ -52,7 +52,10 @@ class Executor(Driver):
         self._source: StopInProgress | HeldMotion | Pending | None = None
         """The stop, motion or command of the frame that `poll` last returned. None for a repetition."""
         self._action_times: deque[float] = deque(maxlen=FREE_ACTIONS)
-        """When the frames of the last actions on parts of the car were written."""
+        """When the first frames of the last actions on parts of the car were written."""
+        self._can_wait_at = float("-inf")
+        """When the last frame was written that an action must not join in the car's buffer: another action, a repeated
+        motion, or a renewed stop."""
         self._steps_written: deque[tuple[float, Speeds]] = deque(maxlen=STEPS_KEPT)
         """When the last steps of the speed were written, and the speeds before them."""
         self._in_write: Frame | None = None
@@ -228,8 +231,8 @@ class Executor(Driver):
         # then takes long. If it reads while this frame arrives behind an unread one, it takes the rest of this frame
         # for the next string, and a digit in it may start the motors.
         pacing = self.model.pacing
-        follows_action = bool(self._action_times) and self._action_times[-1] == pacing.written_at
-        return pacing.act_at(pending.next_frame, alone=follows_action and self.model.is_without_echo)
+        may_join = self._can_wait_at == pacing.written_at and self.model.is_without_echo
+        return pacing.act_at(pending.next_frame, alone=may_join)
 
     @property
     def _next_mode(self) -> Pending | None:
@@ -454,9 +457,12 @@ class Executor(Driver):
             case Pending():
                 if self.stops.running is not None:
                     self.stops.running.on_other_written(now)
-                self._action_times.append(now)
+                if not source.frames_written:  # a command is one action: one that has begun does not wait for a stop
+                    self._action_times.append(now)
+                self._can_wait_at = now
                 self.queue.on_part_written(source, now)
             case None:
+                self._can_wait_at = now
                 model.believed.repeat = False
 
     def allow_for_lost_steps(self, since: float) -> None:

@@ -153,9 +153,11 @@ def test_repeated_drive_of_same_motion_writes_no_frame(desk: Workbench) -> None:
         desk.run(0.25)
         assert desk.ask(Drive(Motion.FORWARD), identity=f"more{number}").status is SENT
         assert desk.life(f"more{number}") == [ASKED, SENT]
+        older = desk.records_of(f"more{number - 1}" if number else "first")
+        assert (older[-1].phase, older[-1].basis) == (SENT, Basis.SENT), "somebody may wait for its end"
     assert desk.frames == [RUN, RUN]
     desk.ask(Drive(Motion.FORWARD, 0.2), PERSON, identity="hers")
-    assert desk.end("first") == (Phase.SUPERSEDED, Reason.SUPERSEDED)
+    assert desk.end("more19") == (Phase.SUPERSEDED, Reason.SUPERSEDED)
     assert desk.control.owner == "mia"
     desk.run(0.1)
     assert desk.frames == [RUN, RUN]
@@ -432,6 +434,15 @@ def test_queued_command_expires_for_busy_car(what: Action, monkeypatch: pytest.M
     desk.run(SHORT_S + 0.1, reports=False)
     assert desk.life("it") == [ASKED, QUEUED, Phase.EXPIRED]
     assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
+
+
+def test_blinking_that_expires_says_how_much_was_sent(desk: Workbench, monkeypatch: pytest.MonkeyPatch) -> None:
+    desk.ask(Find(), identity="it")
+    desk.until(lambda: len(desk.frames) == 2)
+    monkeypatch.setattr(command_queue, "MAX_QUEUE_TIME_S", 0.0)
+    desk.run(0.1)
+    assert desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
+    assert desk.records_of("it")[-1].words.startswith("only 2 of its 4 frames were sent: ")
 
 
 def test_one_shots_queued_before_mode_are_sent_before_it(desk: Workbench) -> None:

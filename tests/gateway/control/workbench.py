@@ -194,11 +194,15 @@ class Workbench:
         """The written frames."""
         return [data for _, data, _ in self.sent]
 
+    def records_of(self, identity: str) -> list[CommandRecord]:
+        """Return the records of a command."""
+        return [record for record in self.records if record.command.id == identity]
+
     def life(self, identity: str) -> list[Phase]:
         """Return the phases of a command."""
-        return [record.phase for record in self.records if record.command.id == identity]
+        return [record.phase for record in self.records_of(identity)]
 
     def end(self, identity: str) -> tuple[Phase, Reason | None]:
         """Return the last phase of a command, and its reason."""
-        record = [record for record in self.records if record.command.id == identity][-1]
+        record = self.records_of(identity)[-1]
         return record.phase, record.reason

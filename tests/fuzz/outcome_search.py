@@ -1,0 +1,299 @@
+"""Searches for outcomes of commands that are false, late or missing, as a client tells them to its user.
+
+An episode has one drawn car (`any_car.draw_car`), its control, and people who send it commands at any moment, also
+before the last ones have ended. Between control and the clients stand the real messages, and a bus that delays them.
+The frames that were written for a command, and the car's true motors, judge what the clients say.
+"""
+
+import random
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Final
+
+from fleet.client import commands
+from fleet.client.commands import CommandRequest
+from fleet.client.outcome import NO_ANSWER, NO_RESULT, Outcome, Progress, Until
+from fleet.client.outcome_words import STOP_VERBS
+from gateway.bus import command_parser
+from gateway.bus.car_service import Request
+from gateway.control.control_output import CommandRecord, OutgoingFrame
+from schemas.commands import COMMANDS, Verb
+from schemas.topics import PROTOBUF
+from schemas.words import Basis, Light, Mode, Motion, Phase, Scope
+from tests.fuzz.any_car import DrawnCar, draw_car
+from tests.support.stops import WORLDS
+from tests.support.virtual import Pair
+
+FALSE_S: Final = 0.3
+"""Maximum time for which a claim may be false."""
+CONNECT_S: Final = 20.0
+AFTER_S: Final = 60.0
+"""Time after the last command, in which every outcome must come."""
+STEP_S: Final = 0.02
+
+
+@dataclass(slots=True)
+class Said:
+    """One command of a client, and what was said about it."""
+
+    identity: str
+    request: CommandRequest
+    progress: Progress
+    asked_at: float
+    due: deque[tuple[float, Callable[[], None]]] = field(default_factory=deque)
+    """Events on their way to the client, in order, and when they arrive."""
+    answer: tuple[float, Callable[[], None]] | None = None
+    """The answer on its way."""
+    frames: list[float] = field(default_factory=list)
+    """When frames were written for it."""
+    told: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.asked_at:.2f} {self.identity} {self.request.verb} {self.request.detail}"
+
+
+@dataclass(slots=True)
+class Told:
+    """Result of an episode."""
+
+    seed: int
+    car: DrawnCar
+    violations: list[str] = field(default_factory=list)
+    outcomes: Counter[str] = field(default_factory=Counter)
+    story: list[str] = field(default_factory=list)
+
+
+class Outcomes:
+    """Plays one episode."""
+
+    def __init__(self, seed: int) -> None:
+        moments = self._moments = random.Random(f"outcome {seed}")
+        car = draw_car(moments, modes=moments.random() < 0.7)
+        world = moments.choices(["echo", "no-echo", "flickering"], [4, 1, 1])[0]
+        self.pair = Pair(
+            car.platform,
+            seed=seed,
+            world=WORLDS[world](),
+            told=car.told,
+            start_s=2.0,
+            traits=car.traits if car.platform == "arduino" else None,
+        )
+        self.told = Told(seed, car)
+        self._people = [f"p{number}" for number in range(moments.choice([1, 1, 2, 3]))]
+        self._kinds = dict(zip(self._people, ("person", "person", "script"), strict=False))
+        self._slow = moments.random() < 0.3
+        """True if the bus is slow at times."""
+        self._said: list[Said] = []
+        self._seen = 0
+        self._linked = False
+        written = self.pair.control.driver.on_written
+
+        def on_written(write: OutgoingFrame, now: float) -> None:
+            for said in self._said:
+                if said.identity == write.command_id:
+                    said.frames.append(now)
+            written(write, now)
+
+        self.pair.control.driver.on_written = on_written  # type: ignore[method-assign]  # the wire has no ids
+
+    def play(self) -> Told:
+        """Send commands at random moments, and wait for the outcome of each."""
+        pair, moments = self.pair, self._moments
+        pair.connect()
+        self._linked = True
+        for person in self._people:
+            pair.control.on_sender_token(person, alive=True, now=pair.now)
+        self._run(moments.choice([0.0, moments.uniform(0.0, 10.0), CONNECT_S]))
+        for _ in range(moments.randrange(3, 12)):
+            self._ask(moments.choice(list(self._requests())))
+            self._run(
+                moments.choice([0.0, moments.uniform(0.0, 0.5), moments.uniform(0.0, 4.0), moments.uniform(0.0, 20.0)])
+            )
+            self._disturb()
+        if not self._linked:
+            self._connect()
+        self._run(AFTER_S)
+        for said in self._said:
+            if said.progress.outcome is None:
+                self._violate(said, f"no outcome after {pair.now - said.asked_at:.1f} s")
+        return self.told
+
+    # ------------------------------------------------------------------ people
+
+    def _requests(self) -> Iterator[CommandRequest]:
+        moments = self._moments
+        yield commands.drive_request(moments.choice(list(Motion)), moments.choice([0.05, 0.5, 2.0, 9.5]))
+        yield commands.drive_request(Motion.FORWARD, moments.uniform(0.2, 4.0), wait=moments.random() < 0.8)
+        yield commands.drive_request(Motion.STOP)
+        yield commands.stop_request()
+        yield commands.stop_request()
+        yield commands.mode_request(moments.choice(list(Mode)))
+        yield commands.mode_request(Mode.MANUAL)
+        if moments.random() < 0.3:
+            yield commands.estop_request("", Scope.CAR)
+        yield commands.resume_request(everything=moments.random() < 0.8)
+        yield commands.pause_request()
+        yield commands.plain_request(Verb.UNPAUSE)
+        yield commands.light_request(moments.choice(list(Light)))
+        yield commands.led_request(1, 2, 3)
+        yield commands.servo_request("front", deg=moments.randrange(181))
+        yield commands.plain_request(Verb.WHISTLE)
+        yield commands.plain_request(Verb.FIND)
+        yield commands.speed_request(moments.choice(["up", "down"]))
+        yield commands.fan_request(moments.choice([None, "on", "off"]))
+        yield commands.lease_request(take=moments.random() < 0.3, release=moments.random() < 0.3)
+
+    def _ask(self, request: CommandRequest) -> None:
+        """Send a command of somebody, and put its answer on the bus."""
+        pair, moments = self.pair, self._moments
+        person = moments.choice(self._people)
+        identity = f"c{len(self._said) + 1}"
+        progress = Progress(
+            "red", request.until, pair.now, request.duration_s, verb=request.effect_verb, detail=request.detail
+        )
+        said = Said(identity, request, progress, pair.now)
+        self._said.append(said)
+        message = type(request.message)()
+        message.CopyFrom(request.message)
+        message.id, message.sender, message.kind, message.take = identity, person, self._kinds[person], request.take
+        encoding = f"{PROTOBUF};{COMMANDS[request.verb].message}"
+        before = len(pair.records)
+        try:
+            command = command_parser.parse(Request(request.verb, message.SerializeToString(), encoding), 0, car="red")
+        except command_parser.BadRequest as error:
+            self._violate(said, f"not parsed: {error.words}")
+            return
+        answer = pair.control.command(command, pair.now)
+        pair._pump()
+        was_sent = any(each.command.id == identity and each.phase is Phase.SENT for each in pair.records[before:])
+        status = Phase.SENT if was_sent and answer.status is Phase.QUEUED else answer.status
+        self.told.story.append(f"{said} by {person}: {status} {answer.words}")
+
+        def arrive() -> None:
+            progress.on_answer(
+                str(status), str(answer.reason or ""), answer.words, answer.worst_case_s or 0.0, pair.now
+            )
+
+        said.answer = pair.now + self._delay_s(), arrive
+        self._take()
+
+    def _delay_s(self) -> float:
+        if self._slow and self._moments.random() < 0.2:
+            return self._moments.uniform(0.0, 3.0)
+        return self._moments.uniform(0.0005, 0.01)
+
+    def _disturb(self) -> None:
+        """Let something else happen, sometimes."""
+        pair, moments = self.pair, self._moments
+        chance = moments.random()
+        if not self._linked:
+            if chance < 0.5:
+                self._connect()
+        elif chance < 0.03:
+            pair.lose()
+            self._linked = False
+        elif chance < 0.06:
+            pair.deaf_until = pair.now + moments.uniform(0.0, 6.0)
+        elif chance < 0.08:
+            pair.lose_frames()
+        elif chance < 0.10:
+            pair.car.brown_out(pair.now)
+        elif chance < 0.12:
+            person = moments.choice(self._people)
+            for alive in (False, True):
+                pair.control.on_sender_token(person, alive=alive, now=pair.now)
+        if chance > 0.5 and "feed" in pair.car.__dict__:
+            pair.pass_frames()
+
+    def _connect(self) -> None:
+        self.pair.connect()
+        self._linked = True
+
+    # ------------------------------------------------------------------ time
+
+    def _run(self, seconds: float) -> None:
+        """Let time pass, pass on what is on the bus, and judge each outcome when it is told."""
+        pair = self.pair
+        end = pair.now + seconds
+        while pair.now < end - 1e-9:
+            pair.run(min(STEP_S, end - pair.now), linked=self._linked)
+            self._take()
+            for said in self._said:
+                self._pass_on(said)
+
+    def _take(self) -> None:
+        """Put new records on the bus, as events."""
+        pair = self.pair
+        for record in pair.records[self._seen :]:
+            for said in self._said:
+                if said.identity == record.command.id:
+                    at = pair.now + self._delay_s()
+                    at = max(at, said.due[-1][0]) if said.due else at
+                    said.due.append((at, self._event_of(said, record)))
+        self._seen = len(pair.records)
+
+    def _event_of(self, said: Said, record: CommandRecord) -> Callable[[], None]:
+        def arrive() -> None:
+            said.progress.on_event(
+                str(record.phase),
+                str(record.reason or ""),
+                record.words,
+                record.worst_case_s,
+                self.pair.now,
+                str(record.basis),
+            )
+
+        return arrive
+
+    def _pass_on(self, said: Said) -> None:
+        now = self.pair.now
+        if said.answer is not None and said.answer[0] <= now:
+            said.answer[1]()
+            said.answer = None
+        while said.due and said.due[0][0] <= now:
+            said.due.popleft()[1]()
+        progress = said.progress
+        if progress.outcome is None and now >= progress.deadline:
+            progress.give_up(now)
+        if progress.outcome is not None and not said.told:
+            said.told = True
+            self._judge(said, progress.outcome)
+
+    # ------------------------------------------------------------------ the judge
+
+    def _judge(self, said: Said, outcome: Outcome) -> None:
+        verb = said.request.verb
+        self.told.outcomes[f"{verb} {outcome.code or outcome.phase} {outcome.basis}"] += 1
+        self.told.story.append(f"{self.pair.now:.2f} {said.identity}: {outcome}")
+        if outcome.code in (NO_ANSWER, NO_RESULT):
+            self._violate(said, f"nothing was lost on the bus, but: {outcome}")
+        if outcome.phase in (Phase.REJECTED, Phase.EXPIRED) and said.frames and "frames were sent" not in outcome.words:
+            self._violate(said, f"frames at {said.frames}, but: {outcome}")
+        if outcome.ok and outcome.effect.endswith(" sent") and verb not in STOP_VERBS and not said.frames:
+            self._violate(said, f"no frame, but: {outcome}")
+        if not str(outcome) or "{" in str(outcome):
+            self._violate(said, f"text {str(outcome)!r}")
+        stops = said.request.until is Until.STOPPED
+        if stops and outcome.ok and outcome.basis == Basis.SHOWN and not self._stood(said.asked_at):
+            self._violate(said, f"the motors ran all the time, but: {outcome}")
+
+    def _stood(self, since: float) -> bool:
+        """Return True if the motors were off at some moment since a time, less a tolerance."""
+        log = self.pair.car.motor_log
+        before = [(left, right) for at, left, right in log if at <= since]
+        return (not before or before[-1] == (0, 0)) or any(
+            (left, right) == (0, 0) for at, left, right in log if at > since
+        )
+
+    def _violate(self, said: Said, words: str) -> None:
+        self.told.violations.append(f"{self.pair.now:.2f} {said}: {words}")
+
+
+def play(seed: int) -> Told:
+    """Play the episode of a seed."""
+    try:
+        return Outcomes(seed).play()
+    except Exception as error:
+        error.add_note(f"seed {seed}")
+        raise
