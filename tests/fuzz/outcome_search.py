@@ -54,7 +54,7 @@ class Said:
 
 
 @dataclass(slots=True)
-class Told:
+class OutcomeReport:
     """Result of an episode."""
 
     seed: int
@@ -79,7 +79,7 @@ class Outcomes:
             start_s=2.0,
             traits=car.traits if car.platform == "arduino" else None,
         )
-        self.told = Told(seed, car)
+        self.told = OutcomeReport(seed, car)
         self._people = [f"p{number}" for number in range(moments.choice([1, 1, 2, 3]))]
         self._kinds = dict(zip(self._people, ("person", "person", "script"), strict=False))
         self._slow = moments.random() < 0.3
@@ -97,7 +97,7 @@ class Outcomes:
 
         self.pair.control.driver.on_written = on_written  # type: ignore[method-assign]  # the wire has no ids
 
-    def play(self) -> Told:
+    def play(self) -> OutcomeReport:
         """Send commands at random moments, and wait for the outcome of each."""
         pair, moments = self.pair, self._moments
         pair.connect()
@@ -290,7 +290,7 @@ class Outcomes:
         self.told.violations.append(f"{self.pair.now:.2f} {said}: {words}")
 
 
-def play(seed: int) -> Told:
+def play(seed: int) -> OutcomeReport:
     """Play the episode of a seed."""
     try:
         return Outcomes(seed).play()
