@@ -102,8 +102,12 @@ class SequenceTracker:
         """Return the number of missing messages."""
         return self._lost + sum(gap.count for sender in self.senders.values() for gap in sender.gaps)
 
-    def add_live(self, sender: Hashable, number: int, published_ns: int) -> bool:
-        """Add a message that is not consecutive. Return False if it was backfilled before."""
+    def add_live(self, sender: Hashable, number: int, content: int) -> bool:
+        """Add a message that is not consecutive. Return False if it was backfilled before.
+
+        `content` is a hash of its payload. Its time is no sign of it: if the clock of its publisher is ahead, each
+        receiver puts its own time on it, but a backfill brings the time of the publisher.
+        """
         known = self.senders.get(sender)
         if known is None:
             self._begin(sender, number)
@@ -113,7 +117,7 @@ class SequenceTracker:
             self._skip(known, known.last, ahead)
             known.last = number
             return True
-        if self._early.get((sender, number)) == published_ns:
+        if self._early.get((sender, number)) == content:
             del self._early[sender, number]
             return False
         if known.fill(number):  # a newer backfilled message came before it
@@ -139,28 +143,28 @@ class SequenceTracker:
         known = self.senders.get(sender)
         return known is not None and any(number in gap for gap in (*known.gaps, *known.earlier_gaps))
 
-    def add_backfilled(self, sender: Hashable, number: int, published_ns: int) -> bool:
-        """Add a backfilled message. Return False if it is a duplicate."""
+    def add_backfilled(self, sender: Hashable, number: int, content: int) -> bool:
+        """Add a backfilled message. Return False if it is a duplicate. `content` is as for `add_live`."""
         known = self.senders.get(sender)
         if known is None:
             self._begin(sender, number)
-            self._expect(sender, number, published_ns)
+            self._expect(sender, number, content)
         elif 0 < (ahead := (number - known.last) % _MODULO) < _BACKWARD:
             self._skip(known, known.last, ahead)
             known.last = number
-            self._expect(sender, number, published_ns)
+            self._expect(sender, number, content)
         elif self._precede(known, number):
             pass
         elif not known.fill(number):
             return False
         elif (sender, known.last) in self._early:  # the original of a newer one has not arrived, so this one's may
-            self._expect(sender, number, published_ns)
+            self._expect(sender, number, content)
         return True
 
-    def _expect(self, sender: Hashable, number: int, published_ns: int) -> None:
+    def _expect(self, sender: Hashable, number: int, content: int) -> None:
         """Remember a backfilled message whose original may still arrive."""
         # Only the newest ones can still arrive, because publications of one publisher keep their order.
-        self._early[sender, number] = published_ns
+        self._early[sender, number] = content
         if len(self._early) > MAX_EARLY_BACKFILLS:
             del self._early[next(iter(self._early))]
 

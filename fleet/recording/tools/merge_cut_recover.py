@@ -16,8 +16,10 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from fleet.recording import session_dir, time_spec
+from fleet.recording.message_identity import identity
 from fleet.recording.reading.mcap_copy import McapCopy
 from fleet.recording.reading.mcap_reader import Extra, Row
+from fleet.recording.reading.message_decoder import message_of
 from fleet.recording.reading.session import NoSession, Session
 from fleet.recording.selection import EVERYTHING, Selection
 from fleet.recording.tools.merged_losses import MergedLosses
@@ -147,10 +149,10 @@ def cut(
 def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter) -> tuple[int, int, str]:
     """Write the messages of several sessions of one fleet, in the order of their recorders' clocks.
 
-    A message that several recorders received is written once. It is recognized by its key, number, publish time and
-    payload. A message without a number is written each time. Return the number of messages, the number of duplicates,
-    and the losses in words. Raises Exists, OSError, and NoSession if the sessions are of several fleets, or none has an
-    intact message.
+    A message that several recorders received is written once. It is recognized by its key, number and payload, and
+    messages of other programs also by their publish time. A message without a number is written each time. Return the
+    number of messages, the number of duplicates, and the losses in words. Raises Exists, OSError, and NoSession if the
+    sessions are of several fleets, or none has an intact message.
     """
     fleets = {each.description.fleet for each in sessions if each.description is not None}
     if len(fleets) > 1:
@@ -170,7 +172,7 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
         seen: set[int] = set()
         for row in heapq.merge(*map(counted, range(len(sessions))), key=lambda row: row[2]):
             info, sequence, _, publish_ns, payload = row
-            told = hash((info.channel.topic, sequence, publish_ns, payload))
+            told = hash((info.channel.topic, sequence, identity(message_of(info), payload, publish_ns)))
             if sequence and told in seen:
                 twice += 1
                 continue

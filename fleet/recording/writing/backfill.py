@@ -20,7 +20,6 @@ from typing import Final
 import zenoh
 
 from fleet.recording.writing.backfill_plan import EVERYTHING, BackfillPlan, PlannedQuery
-from fleet.recording.writing.resume import RESUME_WINDOW_S
 from schemas.bus import Bus
 from schemas.bus.sample import session_of
 from schemas.bus.zenoh_session import RECALL_TIMEOUT_S
@@ -43,7 +42,8 @@ MAX_ANSWERS: Final = 200_000
 class Backfill:
     """Requests missed messages on its own thread, from `start` to `close`."""
 
-    def __init__(self, bus: Bus, expressions: Sequence[str], *, resumes: bool) -> None:
+    def __init__(self, bus: Bus, expressions: Sequence[str], *, resumes_s: float | None = None) -> None:
+        """Prepare. `resumes_s`: how far back to ask first, if this recording continues an interrupted session."""
         self._bus = bus
         self._all = tuple(filter(_has_cache, expressions))
         self._lock = threading.Lock()
@@ -55,7 +55,7 @@ class Backfill:
         """When the thread ends at the latest."""
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
-        self._plan = BackfillPlan(now, resume_since=now - RESUME_WINDOW_S if resumes else None)
+        self._plan = BackfillPlan(now, resume_since=None if resumes_s is None else now - resumes_s)
 
     def start(self) -> None:
         """Start the thread."""

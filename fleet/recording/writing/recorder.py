@@ -193,8 +193,10 @@ class Recorder:
         )
 
     def _new_backfill(self) -> Backfill:
-        recorded = keys.recorded_keys(self._fleet)
-        return Backfill(self._bus, recorded, resumes=bool(self._session.description.continues))
+        session, recorded = self._session, keys.recorded_keys(self._fleet)
+        # Not further back than the interrupted session: the publishers of fast clocks would answer with older messages.
+        age_s = (self._now() - session.resume_since_ns) / 1e9
+        return Backfill(self._bus, recorded, resumes_s=age_s if session.description.continues else None)
 
     def _await_messages_in_transit(self) -> None:
         began = time.monotonic()

@@ -1,14 +1,17 @@
 """Finds an interrupted session that can be continued, because publishers still cache the lost messages."""
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from fleet.recording import session_dir
-from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.message_identity import identity
+from fleet.recording.reading.session import NoSession, Recorded, Session
 from fleet.recording.session_lookup import newest_first
 from fleet.recording.time_spec import iso_ns
+from fleet.recording.writing.publisher_clocks import PublisherClocks
 from schemas.topics import CACHE_S
 
 RESUME_WINDOW_S: Final = 3 * CACHE_S
@@ -21,9 +24,11 @@ class ResumePoint(Struct, frozen=True):
     name: str
     """Name of the interrupted session, or an empty text if there is none."""
     since_ns: int
-    """Publish time from which the new session accepts backfilled messages."""
+    """Time, by the recorder's clock, from which the new session accepts backfilled messages."""
     known: frozenset[tuple[str, int, int]] = frozenset()
-    """Messages recorded since then: key, sequence, publish time."""
+    """Messages recorded since then: key, sequence, identity (message_identity.py)."""
+    clocks: PublisherClocks = field(default_factory=PublisherClocks)
+    """What these messages show of the publishers' clocks."""
 
 
 def find_interrupted(root: Path, fleet: str, now_ns: int) -> ResumePoint:
@@ -37,10 +42,16 @@ def find_interrupted(root: Path, fleet: str, now_ns: int) -> ResumePoint:
     start_ns = now_ns - int(RESUME_WINDOW_S * 1e9)
     # If the recorder was killed twice, the first gap may not be backfilled yet. So read the sessions before it, too.
     chain = [session, *_predecessors(session, start_ns)]
-    known = frozenset(
-        (row.key, row.sequence, row.published_ns) for each in chain for row in each.messages(start_ns=start_ns)
-    )
-    return ResumePoint(session.path.name, max(start_ns, _started_ns(chain[-1])), known)
+    since_ns, known, clocks = max(start_ns, _started_ns(chain[-1])), set[tuple[str, int, int]](), PublisherClocks()
+    for row in _recorded_since(chain, start_ns):
+        known.add((row.key, row.sequence, identity(row.message, row.payload, row.published_ns)))
+        clocks.add(row.key, row.published_ns, row.recorded_ns)
+    return ResumePoint(session.path.name, since_ns, frozenset(known), clocks)
+
+
+def _recorded_since(chain: Iterable[Session], start_ns: int) -> Iterator[Recorded]:
+    for each in chain:
+        yield from each.messages(start_ns=start_ns)
 
 
 def _predecessors(session: Session, start_ns: int) -> list[Session]:

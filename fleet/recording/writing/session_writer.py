@@ -17,6 +17,7 @@ from msgspec import Struct, field
 
 from fleet.quota import Quota
 from fleet.recording import session_dir
+from fleet.recording.message_identity import identity
 from fleet.recording.pins import Pin, PinList
 from fleet.recording.sequence_tracker import SequenceTracker, TrackedSender
 from fleet.recording.stop_count import StopCount
@@ -26,6 +27,7 @@ from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, Reserve, fre
 from fleet.recording.writing.quota_removal import enforce
 from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
+from schemas import messages
 from schemas.bus import sequence_of
 
 MAX_BUFFERED_MESSAGES: Final = 100_000
@@ -79,7 +81,9 @@ class SessionWriter:
         self._made = False
         resume_point = resume.find_interrupted(root, fleet, now_ns) if after is None else after._end_point()
         self.description.continues = resume_point.name
-        self._resume_since_ns, self._recorded = resume_point.since_ns, resume_point.known
+        self.resume_since_ns = resume_point.since_ns
+        """Time, by the recorder's clock, from which messages are accepted, also if they come later."""
+        self._recorded, self._clocks = resume_point.known, resume_point.clocks
         self._metadata = {"fleet": fleet, "started": self.description.started, "host": self.description.host}
         self._metadata |= {**self.description.versions, "format": str(session_dir.FORMAT_VERSION)}
         self.uncopied: list[str] = []
@@ -147,9 +151,10 @@ class SessionWriter:
             if known is not None and known.last == sequence - 1:
                 known.last = sequence
             else:
-                if not state.tracker.add_live(sender, sequence, published_ns):
+                if not state.tracker.add_live(sender, sequence, hash(payload)):
                     return
                 known = state.tracker.senders[sender]
+                self._clocks.add(key, published_ns, received_ns)
                 self._irregular_keys.add(key)
                 self._request(key, known)
             known.heard_ns = received_ns
@@ -172,28 +177,34 @@ class SessionWriter:
         sender = (source.source_id.zid, source.source_id.eid)
         tracker = self._trackers.get(key)
         was_missing = tracker is not None and tracker.is_missing(sender, sequence)
-        # A message in a gap belongs to this session, even if the publisher's clock is slow.
-        if published_ns < self._resume_since_ns and not was_missing:
+        # A message in a gap belongs to this session, whatever the clocks say.
+        if self._clocks.received_ns(key, published_ns) < self.resume_since_ns and not was_missing:
             return False
         state = self._states.get(key)
         if state is None or state.encoding != sample.encoding:
             state = self._key_state(key, sample.encoding)
-        if (
-            not state.tracker.add_backfilled(sender, sequence, published_ns)
-            or (key, sequence, published_ns) in self._recorded
-        ):
+        payload = sample.payload.to_bytes()
+        if not state.tracker.add_backfilled(sender, sequence, hash(payload)):
+            return False
+        if self._recorded and self._is_recorded(key, sequence, str(sample.encoding), payload, published_ns):
             return False
         self._irregular_keys.add(key)
         known = state.tracker.senders[sender]
         known.heard_ns = known.heard_ns or received_ns
         if was_missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
-        self._write((state, received_ns, sample.payload.to_bytes(), published_ns, sequence))
+        self._write((state, received_ns, payload, published_ns, sequence))
         return True
+
+    def _is_recorded(self, key: str, sequence: int, encoding: str, payload: bytes, published_ns: int) -> bool:
+        """Return True if the interrupted session has this message."""
+        told = identity(messages.name_in(encoding) or "", payload, published_ns)
+        return (key, sequence, told) in self._recorded
 
     def _end_point(self) -> resume.ResumePoint:
         """Return where the session begins that follows this one."""
-        return resume.ResumePoint(self.path.name if self._made else "", self._resume_since_ns, self._recorded)
+        name = self.path.name if self._made else ""
+        return resume.ResumePoint(name, self.resume_since_ns, self._recorded, self._clocks)
 
     def _write(self, row: Row) -> None:
         self._unflushed.append(row)

@@ -77,6 +77,17 @@ def test_two_halves_with_something_in_common_are_the_whole(seed: int, whole: Ses
     assert made.description.origin["by"] == "merge"
 
 
+def test_message_that_two_recorders_gave_different_times_is_written_once(whole: Session, tmp_path: Path) -> None:
+    """If the clock of a car is half a second ahead, Zenoh replaces its publish times at each receiver."""
+    rows = sorted(whole.rows(), key=lambda row: row[2])
+    other = [(info, number, log_ns, publish_ns + 1000, payload) for info, number, log_ns, publish_ns, payload in rows]
+    parts = [part_of(whole, tmp_path / "one", rows), part_of(whole, tmp_path / "two", other)]
+    count, twice, lost = merge(parts, tmp_path / "both")
+    named = sum(bool(row[1]) and row[0].schema is not None for row in rows)
+    assert named
+    assert (count, twice, lost) == (2 * len(rows) - named, named, "")
+
+
 def test_merge_names_what_damaged_session_lost(whole: Session, tmp_path: Path) -> None:
     rows = list(whole.rows())
     one, other = (part_of(whole, tmp_path / name, rows[at::2]) for at, name in enumerate(("one", "other")))

@@ -28,7 +28,7 @@ def test_each_window_begins_where_the_gap_does(endpoint: str, bus: Bus) -> None:
     for car in ("slow", "quick"):
         bus.queryable(f"fleet/{car}/state/link/@adv/pub/**", answer)
     with Bus.open(endpoint) as own:
-        backfill = Backfill(own, ["fleet/slow/**", "fleet/quick/**"], resumes=True)
+        backfill = Backfill(own, ["fleet/slow/**", "fleet/quick/**"], resumes_s=30.0)
         backfill.start()
         wait_for(lambda: len(windows) == 2, "both are asked")
         backfill.close()

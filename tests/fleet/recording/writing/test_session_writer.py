@@ -22,10 +22,13 @@ from fleet.recording.tools.summary import SessionState, of_session
 from fleet.recording.tools.verify import verify
 from fleet.recording.writing.disk_space import MB
 from fleet.recording.writing.session_writer import Options, SessionWriter, Sync
+from schemas import messages
+from schemas.gen import fleet_v1_pb2 as pb
 
 BEGUN_NS = 1_790_000_000_000_000_000
 SECOND_NS = 1_000_000_000
 JSON = zenoh.Encoding("application/json")
+RANGE_KEY = "fleet/red/sensor/range"
 
 
 def alone() -> zenoh.Config:
@@ -293,3 +296,67 @@ def test_message_of_a_slow_clock_closes_its_gap(tmp_path: Path) -> None:
     assert not tape.add_backfilled(first, late_ns)
     assert tape.missed == {}
     tape.close(late_ns)
+
+
+def readings(count: int) -> list[zenoh.Sample]:
+    """Return readings of one gateway, numbered from 1, as its cache has them."""
+    samples: list[zenoh.Sample] = []
+    encoding = zenoh.Encoding(messages.encoding_of("fleet.v1.Range"))
+    with zenoh.open(alone()) as one, one.declare_subscriber(RANGE_KEY) as subscriber:
+        out = one.declare_publisher(RANGE_KEY, encoding=encoding)
+        for number in range(count):
+            reading = pb.Range(car="red", boot_id="one start", seq=number + 1, range_m=1.0)
+            out.put(reading.SerializeToString(), source_info=zenoh.SourceInfo(out.id, number))
+            samples.append(subscriber.recv())
+    return samples
+
+
+def hear(tape: SessionWriter, sample: zenoh.Sample, stamp: zenoh.Timestamp | None, received_ns: int) -> None:
+    """Add a message as it was heard. Zenoh replaces the time of a fast clock, which the publisher's cache keeps."""
+    tape.add(RANGE_KEY, sample.payload.to_bytes(), sample.encoding, stamp, sample.source_info, received_ns)
+
+
+def test_message_of_a_fast_clock_is_not_written_again_when_it_arrives(tmp_path: Path) -> None:
+    """Every hub that ended made the messages of a gateway whose clock is a second ahead appear twice."""
+    cached = readings(5)
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    hear(tape, cached[0], cached[1].timestamp, BEGUN_NS)
+    assert all(tape.add_backfilled(each, BEGUN_NS) for each in cached[1:4])
+    for each in cached[1:]:
+        hear(tape, each, cached[0].timestamp, BEGUN_NS + SECOND_NS)
+    tape.close(BEGUN_NS + SECOND_NS)
+    assert numbers(tape.path) == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("behind_s", [0, 3600])
+def test_next_session_takes_what_the_interrupted_one_lacks_whatever_the_clock(tmp_path: Path, behind_s: int) -> None:
+    """The messages of a slow clock were lost between two sessions, and those of a fast clock were in both."""
+    cached = readings(6)
+    assert cached[0].timestamp is not None
+    began_ns = cached[0].timestamp.get_time_as_ntp64().as_nanos() + behind_s * SECOND_NS
+    killed = SessionWriter(tmp_path, "fleet", Options(), began_ns - SECOND_NS // 100)
+    for each in cached[1:4]:
+        hear(killed, each, each.timestamp if behind_s else cached[0].timestamp, began_ns)
+    killed.tick(began_ns)
+    os.utime(killed.path / "0001.mcap", ns=(began_ns, began_ns))
+    after = SessionWriter(tmp_path, "fleet", Options(), began_ns + SECOND_NS)
+    assert after.description.continues == killed.path.name
+    assert [after.add_backfilled(each, began_ns + SECOND_NS) for each in cached[1:]] == [False] * 3 + [True] * 2
+    for tape in (killed, after):
+        tape.close(began_ns + SECOND_NS)
+    assert sorted(numbers(killed.path) + numbers(after.path)) == [2, 3, 4, 5, 6]
+
+
+def test_message_of_a_slow_clock_before_the_interrupted_session_is_in_none(tmp_path: Path) -> None:
+    early, first = readings(1), readings(1)
+    (began,) = (each.timestamp for each in first)
+    assert began is not None
+    began_ns = began.get_time_as_ntp64().as_nanos() + 3600 * SECOND_NS
+    killed = SessionWriter(tmp_path, "fleet", Options(), began_ns)
+    hear(killed, first[0], began, began_ns)
+    killed.tick(began_ns)
+    os.utime(killed.path / "0001.mcap", ns=(began_ns, began_ns))
+    after = SessionWriter(tmp_path, "fleet", Options(), began_ns + SECOND_NS)
+    assert not after.add_backfilled(early[0], began_ns + SECOND_NS)
+    for tape in (killed, after):
+        tape.close(began_ns + SECOND_NS)
