@@ -76,6 +76,11 @@ class Segment:
         return self._tail.start
 
     @property
+    def is_there(self) -> bool:
+        """Return False if somebody has moved or removed the file. All writes would succeed, and be lost."""
+        return self.path.exists() and os.fstat(self._file.fileno()).st_nlink > 0
+
+    @property
     def waiting_bytes(self) -> int:
         """Return the size of the data that is not on the disk yet."""
         return len(self._tail.data)

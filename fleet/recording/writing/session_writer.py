@@ -4,6 +4,8 @@ All methods are called from one thread. The module does not use the bus and star
 """
 
 import contextlib
+import errno
+import os
 import shutil
 from collections.abc import Hashable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -275,6 +277,7 @@ class SessionWriter:
 
     def tick(self, now_ns: int) -> None:
         """Flush, roll over to the next segment if it is due, and check the disk."""
+        self._check_segment()
         self._write_pins()  # write pins before messages, so that after a crash no recorded message lacks its pin
         if self.full:
             self._resume(now_ns)
@@ -319,6 +322,7 @@ class SessionWriter:
 
         Count messages that still do not fit as dropped, and describe them in `cost`.
         """
+        self._check_segment()
         self._try_to_finish()
         dropped = 0
         if self._segment is None and self._unflushed and self._open(now_ns, MIN_CLOSE_BYTES):
@@ -346,16 +350,31 @@ class SessionWriter:
 
     def abandon(self, why: str, now_ns: int) -> str:
         """End a session after a write error, and return a description. Flushed data stays unchanged."""
+        vanished = self._vanished()
         if self._segment is not None:
             self._segment.cut()
         self._drop_buffered()
         dropped = sum(self._drops.values())
-        words = f"{why}. The {self._written} messages before are intact; {dropped} are lost"
+        words = f"{why}. The {self._written - vanished} messages before are intact; {dropped} are lost"
+        if vanished:
+            words += f"; {vanished} were in files that somebody has moved or removed"
         self.description.error = words
         with contextlib.suppress(OSError):  # the disk has failed, as `words` already says
             self._write_info(now_ns, closed=False)
             session_dir.release(self.path)
         return words
+
+    def _check_segment(self) -> None:
+        """Raise FileNotFoundError if somebody has moved or removed the file that is being written."""
+        if self._segment is not None and not self._segment.is_there:
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._segment.path))
+
+    def _vanished(self) -> int:
+        """Return how many of the written messages were in files that are no longer there."""
+        counts: dict[str, int] = {each["file"]: each["messages"] for each in self._index}
+        ended = sum(counts.values())
+        lost = sum(count for file, count in counts.items() if not (self.path / file).exists())
+        return lost + (0 if self._segment is None or self._segment.is_there else self._written - ended)
 
     # ------------------------------------------------------------------ segments
 

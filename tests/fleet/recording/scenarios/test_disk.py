@@ -270,7 +270,33 @@ def test_directory_that_vanishes_is_said_and_ends_the_recorder(endpoint: str, bu
     (line,) = errors.splitlines()
     assert f"{session} failed: " in line
     assert "No such file or directory" in line
+    assert "The 0 messages before are intact" in line
     wait_for(lambda: "failed" in states, "that on the bus")
+
+
+@pytest.mark.parametrize("change", ["removed", "moved", "replaced"])
+def test_file_that_vanishes_while_it_is_written_ends_the_recorder(
+    change: str, endpoint: str, bus: Bus, tmp_path: Path
+) -> None:
+    """A recorder went on into a file that nobody can open, and reported it closed, with all messages."""
+    process = record(endpoint, tmp_path)
+    session = ready(process)
+    file = session / "0001.mcap"
+    wait_for(lambda: any(Session(session).messages()), "something is in the file")
+    if change == "removed":
+        file.unlink()
+    else:
+        file.rename(tmp_path / "elsewhere.mcap")
+    if change == "replaced":
+        (tmp_path / "elsewhere.mcap").unlink()
+        file.write_bytes(b"")
+    text, errors = process.communicate(timeout=60)
+    assert (process.returncode, text) == (1, "")
+    assert "The 0 messages before are intact" in errors
+    description = session_dir.SessionInfo.read(session)
+    assert description is not None
+    assert not description.closed
+    assert "somebody has moved or removed" in description.error
 
 
 def test_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
