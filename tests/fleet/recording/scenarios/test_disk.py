@@ -299,6 +299,27 @@ def test_file_that_vanishes_while_it_is_written_ends_the_recorder(
     assert "somebody has moved or removed" in description.error
 
 
+def test_next_recorder_fetches_what_a_failed_one_has_lost(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    """`fleet up` starts a failed recorder again. What was lost meanwhile was in no session, and counted nowhere."""
+    process = record(endpoint, tmp_path)
+    failed = ready(process)
+    out = publisher(bus, "red", "sensor/range")
+    out.put(pb.Range(range_m=1.0), time.time_ns())
+    wait_for(lambda: holds(failed, out.key) == [1], "it is in the file")
+    (failed / "0001.mcap").unlink()
+    process.communicate(timeout=60)
+    assert process.returncode == 1
+    out.put(pb.Range(range_m=2.0), time.time_ns())
+    process = record(endpoint, tmp_path)
+    session = ready(process)
+    wait_for(lambda: holds(session, out.key) == [1, 2], "both are backfilled")
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=60)
+    description = session_dir.SessionInfo.read(session)
+    assert description is not None
+    assert description.continues == failed.name
+
+
 def test_file_in_the_way_is_one_line(endpoint: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     process = record(endpoint, tmp_path / "file" / "sessions")
