@@ -205,7 +205,11 @@ def info(session: Path, *, as_json: bool) -> None:
         about.marks = marks_of(found, about)
         about.stops = stops_of(found, about)
         description = found.description
-        is_unreadable = not about.messages and about.state in (SessionState.CUT, SessionState.DAMAGED)
+        is_unreadable = not about.messages and about.state in (
+            SessionState.CUT,
+            SessionState.DAMAGED,
+            SessionState.GAPS,
+        )
     origin = description.origin if description is not None else {}
     if as_json:
         more = {"versions": dict(description.versions), "host": description.host} if description is not None else {}

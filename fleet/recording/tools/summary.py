@@ -145,7 +145,7 @@ def of_session(session: Session) -> SessionSummary:
         found.kept = description.kept
         found.pins, found.gone = list(description.pins), session_dir.gone_of(description)
         found.stops = description.stops if description.closed else None  # an open session may lack its last stops
-    found.state, found.words = _state(session, read)
+    found.state, found.words = _state(session, read, found.messages)
     if found.state is SessionState.WHOLE and (words := session.undescribed or session.lacking(found.messages)):
         found.state, found.words = SessionState.DAMAGED, f"{session_dir.SESSION_FILE} {words}"
     if found.state is SessionState.WHOLE and found.gone:
@@ -246,22 +246,23 @@ def _messages(session: Session, about: SessionSummary, topic: str) -> Iterator[t
             yield log_ns, message
 
 
-def _state(session: Session, read: Session) -> tuple[SessionState, str]:
+def _state(session: Session, read: Session, messages: int) -> tuple[SessionState, str]:
     """Return the state, and its reason. `read` has the damage of the files that were read for lack of an index."""
+    repair = f": `{_recover(session)}` repairs it" if messages else ", and no message is in it"
     description = session.description
     if session.damage:
         return SessionState.DAMAGED, session.damage_words
     if description is not None and not description.closed:
         if _is_written_lately(session) and not description.ended:
             return SessionState.RECORDING, ""
-        return (
-            SessionState.CUT,
-            description.error or f"the recorder did not close it: `{_recover(session)}` repairs it",
-        )
+        if description.ended and description.error:  # the recorder failed, and has counted its losses
+            return SessionState.CUT, description.error
+        why = f" ({description.error.rstrip('.')})" if description.error else ""
+        return SessionState.CUT, f"the recorder did not close it{why}{repair}"
     if damaged := sorted(read.damage.keys() - read.unended):
         return SessionState.DAMAGED, f"{damaged[0].name} {read.damage[damaged[0]]}"
-    if read.unended:
-        return SessionState.CUT, f"{min(read.unended).name} has no intact end: `{_recover(session)}` repairs it"
+    if read.unended and (messages or description is None or not description.drops):
+        return SessionState.CUT, f"{min(read.unended).name} has no intact end{repair}"
     return SessionState.WHOLE, ""
 
 

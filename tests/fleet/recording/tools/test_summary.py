@@ -2,16 +2,21 @@
 
 import itertools
 import json
+import os
 import threading
+import time
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner, Result
+from msgspec.structs import replace
 
 from fleet.cli import cli
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
-from fleet.recording.tools.summary import SessionState, growth_check, overview
+from fleet.recording.tools.summary import SessionState, SessionSummary, growth_check, overview
 from fleet.recording.writing.segment_writer import Segment
+from tests.support.text_parts import has_parts
 
 START = 1_790_000_000_000_000_000
 S = 1_000_000_000
@@ -77,6 +82,41 @@ def test_file_in_which_nothing_was_recorded_cuts_no_session(tmp_path: Path) -> N
     Segment(path / "0002.mcap", {}).finish({})
     found = overview(path)
     assert (found.state, found.words, found.length_s) == (SessionState.WHOLE, "", 2.0)
+
+
+def end(path: Path, **fields: object) -> SessionSummary:
+    """Return the summary of a session that was last written a minute ago, with these fields in its description."""
+    info = session_dir.SessionInfo.read(path)
+    assert info is not None
+    replace(info, **fields).write(path)
+    os.utime(path / "0001.mcap", (time.time() - 60, time.time() - 60))
+    return overview(path)
+
+
+@pytest.mark.parametrize("has_messages", [False, True])
+def test_repair_is_proposed_only_where_there_is_a_message(tmp_path: Path, has_messages: bool) -> None:
+    write(tmp_path / "one", [[1, 2]] if has_messages else [], closed=False)
+    killed, ended = end(tmp_path / "one"), end(tmp_path / "one", closed=True)
+    assert (killed.state, ended.state) == (SessionState.CUT, SessionState.CUT)
+    for found in (killed, ended):
+        assert ("fleet sessions recover" in found.words) == has_messages, found.words
+    assert (run("recover", tmp_path / "one").exit_code == 0) == has_messages
+
+
+def test_session_that_dropped_everything_lacks_messages(tmp_path: Path) -> None:
+    write(tmp_path, [], closed=False)
+    found = end(tmp_path, closed=True, drops={"fleet/red/x": 45})
+    assert (found.state, found.lost) == (SessionState.GAPS, 45)
+    assert "45 messages were lost" in found.words
+    assert run("info", tmp_path).exit_code == 1
+
+
+def test_recorder_killed_in_a_pause_is_not_said_to_wait(tmp_path: Path) -> None:
+    write(tmp_path, [[1, 2]], closed=False)
+    found = end(tmp_path, error="disk: No space left on device. Recording pauses until there is room.")
+    assert has_parts(found.words, "the recorder did not close it … No space left … fleet sessions recover"), found
+    failed = end(tmp_path, error="recording failed: Input/output error", ended="2026-09-21T14:14:00Z")
+    assert failed.words == "recording failed: Input/output error"
 
 
 def test_clock_that_went_back_makes_no_hour(tmp_path: Path) -> None:
