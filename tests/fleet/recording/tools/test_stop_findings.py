@@ -5,8 +5,10 @@ from collections.abc import Iterator
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
+from fleet.recording.tools.moment import Known
 from fleet.recording.tools.recorder_clock import WINDOW_NS, RecorderClock
 from fleet.recording.tools.stop_findings import StopFindings
+from schemas import keys
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support.zones import zone
 
@@ -94,6 +96,21 @@ def test_stamps_of_a_wrong_clock_become_times_of_the_recorder() -> None:
     late_ns = NOON_NS + 100 * SECOND_NS
     assert recorder_clock.at_ns("red", late_ns - wrong_ns, late_ns + 20 * SECOND_NS) == late_ns + SHORT_NS
     assert recorder_clock.at_ns("blue", late_ns, late_ns) == late_ns
+
+
+def test_clock_that_is_set_back_puts_nothing_before_its_past() -> None:
+    """For a minute, everything after the step seemed to have happened an hour before, and stood before the rest."""
+    recorder_clock, found, key = RecorderClock(), list[int](), keys.parse("fleet/red/state/mode")
+    assert key is not None
+    for second in range(100):
+        at_ns = NOON_NS + second * SECOND_NS
+        stamp_ns = at_ns - (3600 * SECOND_NS if second >= 50 else 0)
+        mode = pb.Mode(boot_id="a start", seq=second + 1)
+        mode.stamp.seconds, mode.stamp.nanos = divmod(stamp_ns, SECOND_NS)
+        late_ns = 5 * SECOND_NS if second in (20, 80) else SHORT_NS
+        known = Known(key, mode, at_ns + late_ns, stamp_ns)
+        found.append(recorder_clock.time_ns(known) - at_ns)
+    assert found == [SHORT_NS] * 100
 
 
 def test_step_of_the_recorders_clock_counts_after_two_windows() -> None:
