@@ -254,7 +254,7 @@ def _state(session: Session, read: Session, messages: int) -> tuple[SessionState
         return SessionState.DAMAGED, session.damage_words
     if description is not None and not description.closed:
         if _is_written_lately(session) and not description.ended:
-            return SessionState.RECORDING, ""
+            return SessionState.RECORDING, description.error
         if description.ended and description.error:  # the recorder failed, and has counted its losses
             return SessionState.CUT, description.error
         why = f" ({description.error.rstrip('.')})" if description.error else ""

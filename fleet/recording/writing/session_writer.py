@@ -25,7 +25,7 @@ from fleet.recording.sequence_tracker import SequenceTracker, TrackedSender
 from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume
-from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, Reserve, free_bytes, shortage
+from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, MIN_START_BYTES, Reserve, free_bytes, shortage
 from fleet.recording.writing.quota_removal import enforce
 from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
@@ -69,7 +69,7 @@ class SessionWriter:
     """Writes one new session. Raises OSError if the session cannot be created or written.
 
     A full disk is not an error: `full` names it, new messages are buffered, and writing resumes when there is space.
-    If the disk is full from the start, `path` is the future directory of the session.
+    If the disk is full to the last byte from the start, `path` is the future directory of the session.
 
     `after` is the session that this one follows without a pause, if there is one.
     """
@@ -124,7 +124,8 @@ class SessionWriter:
         not fit on the full disk."""
         self._unflushed: list[Row] = []
         self._reset_segment(now_ns)
-        self._open(now_ns, self._options.reserve.to_begin)
+        if not self._open(now_ns, self._options.reserve.to_begin):
+            self._begin_without_room(now_ns)
 
     # ------------------------------------------------------------------ messages
 
@@ -280,6 +281,7 @@ class SessionWriter:
         self._check_segment()
         self._write_pins()  # write pins before messages, so that after a crash no recorded message lacks its pin
         if self.full:
+            self._touch()
             self._resume(now_ns)
             return
         assert self._segment is not None
@@ -369,6 +371,17 @@ class SessionWriter:
         if self._segment is not None and not self._segment.is_there:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._segment.path))
 
+    def _touch(self) -> None:
+        """Set the time of the newest file to now, although nothing can be written to it.
+
+        By this time, others know that the session is in use: `fleet sessions`, the quota of another recorder, and the
+        next recorder, if this one is killed.
+        """
+        if self._made:
+            newest = session_dir.segment(self.path, self.segments)
+            with contextlib.suppress(OSError):  # it was removed, or the disk has failed: the next write says so
+                os.utime(newest)
+
     def _vanished(self) -> int:
         """Return how many of the written messages were in files that are no longer there."""
         counts: dict[str, int] = {each["file"]: each["messages"] for each in self._index}
@@ -404,6 +417,28 @@ class SessionWriter:
             session_dir.reserve(self.path)
         self._on_room()
         return True
+
+    def _begin_without_room(self, now_ns: int) -> None:
+        """Make a session that has to wait for room, with an empty file that can be opened.
+
+        If the recorder is killed while it waits, the session says that messages are lost, and why, and the next
+        recorder continues it. It uses some of the reserve. If the disk is full to the last byte, nothing is made.
+        """
+        if shortage(self.free_bytes, MIN_START_BYTES):
+            return
+        try:
+            self.path = session_dir.create(self.path, self.description)
+            self._made = True
+            self._begin_segment(now_ns)
+            self._finish_segment()
+        except OSError as error:
+            if not session_dir.is_full(error):
+                raise
+            shutil.rmtree(self.path, ignore_errors=True)
+            self._made = False
+            self._reset_segment(now_ns)
+        else:
+            self._copy_files()
 
     def _reset_segment(self, now_ns: int) -> None:
         self._counts = SegmentCounts()

@@ -15,6 +15,7 @@ import pytest
 
 from fleet.recording import session_dir
 from fleet.recording.reading.session import NoSession, Session
+from fleet.recording.tools.summary import SessionState, of_session, overview
 from fleet.recording.tools.verify import verify
 from fleet.recording.writing.disk_space import MB, Reserve
 from fleet.recording.writing.session_writer import Options, SessionWriter
@@ -25,6 +26,7 @@ from tests.fleet.recording.test_record_command import ready
 from tests.fleet.recording.writing.test_session_writer import BEGUN_NS, SECOND_NS, feed
 from tests.support import in_process
 from tests.support.disk import DISKS, MAY_MOUNT, disk
+from tests.support.text_parts import has_parts
 
 pytestmark = pytest.mark.xdist_group("disk")  # these tests fill the same disk
 
@@ -151,7 +153,7 @@ def test_stop_on_full_disk_writes_what_fits_and_tells_drops(kind: str, endpoint:
 
 
 @pytest.mark.parametrize("kind", DISKS)
-def test_disk_full_at_start_is_waited_for_without_leftovers(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
+def test_disk_full_at_start_is_waited_for(kind: str, endpoint: str, bus: Bus, tmp_path: Path) -> None:
     with disk(kind, tmp_path) as there:
         there.fill()
         process = record(endpoint, there.root, *there.options)
@@ -161,7 +163,10 @@ def test_disk_full_at_start_is_waited_for_without_leftovers(kind: str, endpoint:
         for _ in range(100):
             out.put(pb.Range(range_m=1.0), time.time_ns())
         wait_for(lambda: status(bus).messages > 100, "those wait")
-        assert list(there.root.glob("*")) == []
+        if kind == "keep free":
+            assert (of_session(Session(session)).messages, list(there.root.glob("*"))) == (0, [session])
+        else:
+            assert list(there.root.glob("*")) == []
         marked = fleet(endpoint, "mark", "full")
         assert marked.returncode == 1
         assert status(bus).error.partition(";")[0] in marked.stderr, "why it is not in a file yet"
@@ -178,6 +183,37 @@ def test_disk_full_at_start_is_waited_for_without_leftovers(kind: str, endpoint:
         assert [mark["text"] for mark in opened.description.marks] == ["full"]
         assert "Recording pauses" in errors
         assert f"room again: recording continues to {session}" in errors
+
+
+def test_recorder_killed_before_there_was_room_is_in_the_list(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    """It left no trace: what it had buffered was gone, and the next recorder did not fetch it."""
+    with disk("keep free", tmp_path) as there:
+        there.fill()
+        process = record(endpoint, there.root, *there.options)
+        session = ready(process)
+        out = publisher(bus, "red", "sensor/range")
+        out.put(pb.Range(range_m=1.0), time.time_ns())
+        wait_for(lambda: status(bus).messages > 1, "it waits")
+        os.utime(session / "0001.mcap", (0, 0))
+        wait_for(lambda: overview(session).state == SessionState.RECORDING, "it is seen to be at work")
+        assert "Recording pauses until there is room" in overview(session).words
+        process.kill()
+        process.communicate(timeout=60)
+        os.utime(
+            session / "0001.mcap", (time.time() - 6, time.time() - 6)
+        )  # instead of 5 s in which it may be recording
+        found = overview(session)
+        assert (found.state, found.messages) == (SessionState.CUT, 0)
+        assert has_parts(found.words, "the recorder did not close it … are left on the disk … no message is in it")
+        there.free()
+        process = record(endpoint, there.root, *there.options)
+        following = ready(process)
+        wait_for(lambda: holds(following, out.key) == [1], "the next one fetches it")
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=60)
+        description = session_dir.SessionInfo.read(following)
+        assert description is not None
+        assert description.continues == session.name
 
 
 @pytest.mark.parametrize("kind", DISKS)
