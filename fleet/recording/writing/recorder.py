@@ -12,6 +12,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,6 +29,7 @@ from fleet.recording.writing.recorder_service import (
     MARK_TOPIC,
     STATUS_TIMEOUT_S,
     STATUS_TOPIC,
+    AnotherRecorder,
     RecorderService,
 )
 from fleet.recording.writing.session_writer import Options, SessionWriter
@@ -59,6 +61,8 @@ MAX_DRAIN_DELAY_S: Final = 0.2
 both waits are repeated."""
 MAX_SHUTDOWN_DRAIN_S: Final = 5.0
 """Maximum time for all repetitions, on a machine that stays too busy."""
+RIVAL_S: Final = 5.0
+"""Time after the start in which another recorder may be heard that has started at the same moment."""
 MAX_PENDING_QUERIES: Final = 64
 MAX_STOP_S: Final = 8.0
 """Maximum time for which a session that is to be closed waits for its missing messages. Before that, the recorder may
@@ -90,6 +94,9 @@ _Item = tuple[str, bytes, zenoh.Encoding, "zenoh.Timestamp | None", "zenoh.Sourc
 
 class Recorder:
     """Records from `start` to `close`. If the disk fails, `ended` is set and `close` raises RecordingFailed.
+
+    If another recorder has started at the same moment, one of the two closes its session and sets `ended`, and its
+    `close` raises AnotherRecorder.
 
     If the disk is full, also at the start, the recorder waits for space, and `full` gives the reason.
 
@@ -140,6 +147,9 @@ class Recorder:
         self._reader_error: Exception | None = None
         self._subscribers: list[SampleChannel] = []
         self._error = ""
+        self._rival: AnotherRecorder | None = None
+        """Set if another recorder has started at the same moment, and goes on alone."""
+        self._alone_from = inf
         self._recording = True
         self.ended = threading.Event()
         """Set when the writer has closed the session or failed."""
@@ -165,6 +175,7 @@ class Recorder:
         self._writer.start()
         self._backfill.start()
         self._service.open(self._on_query)
+        self._alone_from = time.monotonic() + RIVAL_S
         return session
 
     @property
@@ -173,7 +184,7 @@ class Recorder:
         return self._session.full
 
     def close(self) -> RecordingOutcome:
-        """Write all received messages, and close the session. Raises RecordingFailed if that fails."""
+        """Write all received messages, and close the session. Raises RecordingFailed and AnotherRecorder."""
         if not self.ended.is_set():
             self._await_messages_in_transit()
         with self._lock:
@@ -187,6 +198,8 @@ class Recorder:
         self._writer.join()
         if self._error:
             raise RecordingFailed(self._error)
+        if self._rival is not None:
+            raise self._rival
         session = self._session
         return RecordingOutcome(
             session.path, session.messages, session.bytes, dict(session.drops), session.missed, session.cost
@@ -273,7 +286,7 @@ class Recorder:
     def _write(self) -> None:
         try:
             due = time.monotonic()
-            while not self._reader_done.wait(WRITE_INTERVAL_S):
+            while not self._rival and not self._reader_done.wait(WRITE_INTERVAL_S):
                 self._drain()
                 if time.monotonic() >= due:
                     due = max(due + FLUSH_INTERVAL_S, time.monotonic())
@@ -307,6 +320,7 @@ class Recorder:
                 add(*item)
             self._pin(batch)
             self._take_marks(batch)
+            self._look_for_rival(batch)
             self._add_backfilled(backfilled, answered_ns)
             for (key, sender), (count, number) in overflow.items():
                 self._session.drop_received(key, sender, number, count)
@@ -327,6 +341,17 @@ class Recorder:
                 published_ns = received_ns if stamp is None else stamp.get_time_as_ntp64().as_nanos()
                 for pin in watch.add(key, str(encoding), payload, published_ns, received_ns):
                     self._session.pin(pin)
+
+    def _look_for_rival(self, batch: Sequence[_Item]) -> None:
+        """End if another recorder that has started at the same moment is to go on."""
+        if time.monotonic() > self._alone_from:
+            return
+        for key, payload, encoding, *_ in batch:
+            if key == self._service.own_status:
+                try:
+                    self._service.yield_to_another(payload, str(encoding))
+                except AnotherRecorder as rival:
+                    self._rival, self._session.description.error = rival, str(rival)
 
     def _take_marks(self, batch: Sequence[_Item]) -> None:
         """Add marks that the recorder of another site has set, so that this session is kept, too."""

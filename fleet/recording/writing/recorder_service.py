@@ -14,14 +14,19 @@ from typing import Any, Final
 
 import zenoh
 
-from schemas import keys
+from schemas import keys, messages
 from schemas.bus import Bus, BusError, messages_of
+from schemas.printable import printable
 from schemas.topics import TOPICS
+from schemas.words import RecorderState
 
 STATUS_TOPIC: Final = TOPICS["@recorder/status"]
 MARK_TOPIC: Final = TOPICS["@recorder/mark"]
 STATUS_TIMEOUT_S: Final = 5.0
 """Timeout for the status of another recorder, which answers only between two writes to its disk."""
+
+
+_AT_WORK: Final = (RecorderState.RECORDING, RecorderState.FULL, RecorderState.STOPPED)
 
 
 class AnotherRecorder(Exception):
@@ -44,7 +49,7 @@ class RecorderService:
         self._fleet = fleet
         self._site = site if not site else keys.check_name(site, "site")
         self._token = keys.recorder_token(fleet, site)
-        self._own_status = f"{self._token}/status"
+        self.own_status = f"{self._token}/status"
         self._fleet_status = f"{fleet}/{STATUS_TOPIC.name}"
         self.mark_key = f"{fleet}/{MARK_TOPIC.name}"
         self._others: set[str] = set()
@@ -56,18 +61,33 @@ class RecorderService:
         if not self._bus.tokens(self._token):
             return
         where = "to an unknown place"
-        for message in messages_of(self._bus.query(self._own_status, timeout_s=STATUS_TIMEOUT_S)):
+        for message in messages_of(self._bus.query(self.own_status, timeout_s=STATUS_TIMEOUT_S)):
             where = f"to {message.session}"
+        raise self._another(where)
+
+    def yield_to_another(self, payload: bytes, encoding: str) -> None:
+        """Raise AnotherRecorder if this status is of a recorder that goes on, because its boot id is lower.
+
+        Two that start at the same moment do not see each other's token, but each hears the status of the other.
+        """
+        try:
+            status: Any = messages.parse(STATUS_TOPIC.message, payload, encoding)
+        except messages.BadPayload:
+            return
+        if status.state in _AT_WORK and "" < status.boot_id < self._bus.boot_id:
+            raise self._another(f"to {printable(status.session)}")
+
+    def _another(self, where: str) -> AnotherRecorder:
         if self._site:
-            raise AnotherRecorder(f"site {self._site} is recorded already, {where}. One recorder at a site is enough.")
-        raise AnotherRecorder(
+            return AnotherRecorder(f"site {self._site} is recorded already, {where}. One recorder at a site is enough.")
+        return AnotherRecorder(
             f"{keys.describe_fleet(self._fleet).capitalize()} is recorded already, {where}. One recorder is enough; at "
             "another site, `fleet record --site NAME` records, too."
         )
 
     def declare_publishers(self) -> None:
         """Declare the publishers."""
-        status = dict.fromkeys((self._fleet_status, self._own_status))  # the two keys are equal, except at another site
+        status = dict.fromkeys((self._fleet_status, self.own_status))  # the two keys are equal, except at another site
         self._status = [self._bus.publisher(key, STATUS_TOPIC, keys.RECORDER) for key in status]
         self._marks = self._bus.publisher(self.mark_key, MARK_TOPIC, keys.RECORDER)
 
@@ -86,7 +106,7 @@ class RecorderService:
 
         if self._site:
             self._bus.watch_tokens(keys.recorder_token(self._fleet, "**"), self._on_token)
-            self._bus.queryable(self._own_status, lambda query: on_query(query, self._own_status))
+            self._bus.queryable(self.own_status, lambda query: on_query(query, self.own_status))
         self._bus.queryable(self._fleet_status, for_fleet)
         for expression in keys.command_keys(self._fleet, keys.RECORDER):
             self._bus.queryable(expression, for_fleet)

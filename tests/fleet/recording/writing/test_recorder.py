@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from functools import cached_property
 from itertools import cycle
@@ -22,7 +23,7 @@ from fleet.client.services import ask_recorder
 from fleet.quota import Quota
 from fleet.recording.writing.backfill import BACKFILL_POLL_INTERVAL_S, LEASE_POLLS
 from fleet.recording.writing.recorder import Recorder
-from fleet.recording.writing.recorder_service import AnotherRecorder
+from fleet.recording.writing.recorder_service import AnotherRecorder, RecorderService
 from fleet.recording.writing.session_writer import Options
 from schemas import keys, messages
 from schemas.bus import Bus, Publisher, Sample, router_config
@@ -372,6 +373,35 @@ def test_second_recorder_is_refused_and_told_of_the_first(endpoint: str, bus: Bu
         other.close()
         recorder.close()
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_of_two_recorders_that_start_at_once_one_goes_on(
+    endpoint: str, bus: Bus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither saw the token of the other, so both recorded, and a command reached one of them by chance."""
+    both_have_looked, look = threading.Barrier(2), RecorderService.refuse_a_second
+
+    def look_at_once(service: RecorderService) -> None:
+        look(service)
+        both_have_looked.wait(30.0)
+
+    monkeypatch.setattr(RecorderService, "refuse_a_second", look_at_once)
+    with Bus.open(endpoint) as one, Bus.open(endpoint) as other:
+        buses = sorted((one, other), key=lambda each: each.boot_id)
+        recorders = [Recorder(each, "fleet", tmp_path) for each in buses]
+        with ThreadPoolExecutor() as pool:
+            first, second = pool.map(Recorder.start, recorders)
+        assert recorders[1].ended.wait(30.0)
+        with pytest.raises(AnotherRecorder, match=str(first)):
+            recorders[1].close()
+        assert not recorders[0].ended.is_set()
+        found = ask_recorder(bus, "fleet", RecorderVerb.STATUS)
+        assert found is not None
+        assert (found.session, found.state) == (str(first), RecorderState.RECORDING)
+        recorders[0].close()
+    description = json.loads((second / "session.json").read_text())
+    assert description["closed"]
+    assert str(first) in description["error"]
 
 
 def test_flush_each_second_reaches_disk(endpoint: str, bus: Bus, tmp_path: Path) -> None:
