@@ -461,7 +461,7 @@ class Fleet:
                 if isinstance(answer, Sample):
                     command.inbox.put((time.monotonic(), answer))
                 else:
-                    why_silent = "" if answer.words == "Timeout" else answer.words  # see QueryEnded
+                    why_silent = "" if answer.is_timeout else answer.words  # see QueryEnded
         finally:
             command.inbox.put((time.monotonic(), QueryEnded(target, why_silent)))
 

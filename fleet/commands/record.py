@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from fleet.client.client import certified_sender, default_sender
-from fleet.client.services import ask_recorder, site_recordings, why_unrecorded
+from fleet.client.services import RECORDER_TIMEOUT_S, ask_recorder, site_recordings, why_unrecorded
 from fleet.commands.command_group import (
     DefaultCommandGroup,
     chosen_person,
@@ -287,6 +287,11 @@ def _ask(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
     """Send a command to the recorder of this fleet and return its status. Raises click's errors."""
     fields["sender"] = certified_sender(bus.identity, person=chosen_person())
     answer = ask_recorder(bus, fleet, verb, **fields)
+    if isinstance(answer, Failure) and answer.is_timeout:
+        raise click.ClickException(
+            f"The recorder has not answered within {RECORDER_TIMEOUT_S:g} s: its disk is slow, or it hangs. It may "
+            f"still do what you asked ({verb}). `fleet record status` shows its state."
+        )
     if isinstance(answer, Failure):
         raise click.ClickException(f"the recorder says: {answer.words}")
     if answer is not None:

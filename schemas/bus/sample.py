@@ -50,9 +50,14 @@ class Sample(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """An error reply."""
+    """An error reply, or the end of a query that nobody has answered in time."""
 
     words: str
+
+    @property
+    def is_timeout(self) -> bool:
+        """True if nobody has answered in time."""
+        return self.words == "Timeout"  # Zenoh's word
 
 
 def messages_of(answers: "Iterable[Sample | Failure]") -> "Iterator[Any]":

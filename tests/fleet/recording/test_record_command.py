@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
 from fleet.recording.reading.session import Session
 from fleet.recording.session_dir import SESSION_FILE
 from fleet.recording.time_spec import iso_ns
+from schemas import keys
 from schemas.bus import Bus
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import PinCause
 from tests.fleet.recording.conftest import heard, popen, publisher, wait_for
 from tests.support import in_process
+from tests.support.text_parts import has_parts
 
 RECORD = "from fleet.commands.record import record; record()"
 
@@ -183,3 +186,15 @@ def test_fleet_file_mistake_costs_pins_not_recording(endpoint: str, bus: Bus, tm
     assert str(rules) in errors
     assert "rnage_m" in errors
     assert [each.key for each in Session(session).messages() if each.key == "fleet/red/sensor/range"]
+
+
+def test_recorder_that_does_not_answer_is_not_quoted(endpoint: str, bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`the recorder says: Timeout`: it had said nothing, and its disk was slow."""
+    monkeypatch.setattr("fleet.client.services.RECORDER_TIMEOUT_S", 0.5)
+    unanswered: list[zenoh.Query] = []
+    for expression in keys.command_keys("fleet", keys.RECORDER):
+        bus.queryable(expression, unanswered.append)
+    done = in_process.fleet("record", "stop", "--connect", endpoint)
+    assert len(unanswered) == 1
+    assert done.returncode == 1
+    assert has_parts(done.stderr, "has not answered within … may still … (stop) … fleet record status"), done.stderr
