@@ -158,7 +158,9 @@ def merge(sessions: Sequence[Session], out: Path, with_progress: Progress = iter
     if len(fleets) > 1:
         raise NoSession(f"these are sessions of several fleets: {', '.join(sorted(fleets))}")
     twice, counts = 0, [0] * len(sessions)
-    losses = MergedLosses([each.description for each in sessions])
+    before = {each.description.continues for each in sessions if each.description is not None}
+    continued = [number for number, each in enumerate(sessions) if each.name in before]
+    losses = MergedLosses([each.description for each in sessions], continued)
 
     def counted(number: int) -> Iterator[Row]:
         for row in sessions[number].rows():

@@ -4,10 +4,11 @@ A recorder counts the messages that it dropped, and those that never reached it.
 have them. So each message of another session, within the time of a session that does not have it, makes up for one loss
 of that session. Losses of sessions that overlap may be the same messages, so the result is a number that was surely
 lost, and more may be. If a session was cut in two, a backfill may have brought messages of the first part in the time
-of the second one. So what only parts miss counts only if the numbers in the merged session have a gap.
+of the second one. And what a session lacks at its end, the one that continues it may have fetched. So what only such
+sessions lack counts only if the numbers in the merged session have a gap.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from fleet.recording.reading.mcap_reader import Row
 from fleet.recording.session_dir import SessionInfo
@@ -20,18 +21,22 @@ _FOREVER_NS = 2**63
 class MergedLosses:
     """The losses of the sessions that are being merged, by key."""
 
-    def __init__(self, sessions: Sequence[SessionInfo | None]) -> None:
-        """`sessions` are the descriptions of the sessions. A session without one has counted no losses."""
+    def __init__(self, sessions: Sequence[SessionInfo | None], continued: Collection[int] = ()) -> None:
+        """`sessions` are the descriptions of the sessions. A session without one has counted no losses.
+
+        `continued`: the places in `sessions` of those that another one of them continues.
+        """
         self._lossy: dict[int, tuple[SessionInfo, tuple[int, int]]] = {
             number: (info, _span_ns(info))
             for number, info in enumerate(sessions)
             if info is not None and (info.drops or info.missed)
         }
-        infos = [info for info, _ in self._lossy.values()]
-        of_parts = {key for info in infos if _is_part(info) for key in info.missed}
-        of_others = {key for info in infos for key in (*info.drops, *(() if _is_part(info) else info.missed))}
-        self._of_parts = of_parts - of_others
-        """Keys of which only parts miss messages. These may be in another part of the same session."""
+        late, never = set[str](), set[str]()
+        for number, (info, _) in self._lossy.items():
+            (late if number in continued else never).update(info.drops)
+            (late if number in continued or _is_part(info) else never).update(info.missed)
+        self._come_late = late - never
+        """Keys of which all that is lacking may be in the next part, or in the session that continues this one."""
         self._numbers = NumberGaps()
         """The numbers of these keys in the merged session."""
         self._own: dict[tuple[int, str], int] = {}
@@ -47,7 +52,7 @@ class MergedLosses:
     def on_written(self, row: Row) -> None:
         """Count a message of the merged session."""
         key, log_ns = row[0].channel.topic, row[2]
-        if key in self._of_parts:
+        if key in self._come_late:
             self._numbers.add(row)
         for number, (_, (begin_ns, end_ns)) in self._lossy.items():
             if begin_ns <= log_ns <= end_ns:
@@ -60,8 +65,9 @@ class MergedLosses:
         for key in {key for info, _ in self._lossy.values() for key in (*info.drops, *info.missed)}:
             drops[key], missed[key] = self._surely_lost(key)
         gaps = self._numbers.missing()
-        for key in self._of_parts:
-            missed[key] = min(missed[key], gaps.get(key, 0))
+        for key in self._come_late:
+            drops[key] = min(drops[key], gaps.get(key, 0))
+            missed[key] = min(missed[key], gaps.get(key, 0) - drops[key])
         return _without_zeros(drops), _without_zeros(missed)
 
     def _surely_lost(self, key: str) -> tuple[int, int]:

@@ -185,6 +185,27 @@ def test_part_counts_the_messages_that_a_backfill_brought_after_it(whole: Sessio
     assert of_session(Session(tmp_path / "both")).state is SessionState.WHOLE
 
 
+@pytest.mark.parametrize("lost", [0, 1])
+def test_what_the_next_session_has_fetched_is_not_lost(lost: int, whole: Session, tmp_path: Path) -> None:
+    """A recorder failed, and the next one fetched what it had dropped: merged, all was there and counted as dropped."""
+    rows = sorted(whole.rows(), key=lambda row: row[2])
+    key = rows[len(rows) // 2][0].channel.topic
+    late = [row for row in rows if row[0].channel.topic == key][1:4]
+    half_ns = rows[len(rows) // 2][2]
+    assert late[-1][2] < half_ns
+    before = [row for row in rows if row[2] < half_ns and row not in late]
+    fetched = [(info, number, half_ns, publish_ns, data) for info, number, _, publish_ns, data in late[lost:]]
+    after = [*fetched, *(row for row in rows if row[2] >= half_ns)]
+    failed = part_of(whole, tmp_path / "failed", before, drops={key: 2}, missed={key: 1})
+    following = part_of(whole, tmp_path / "following", after)
+    assert following.description is not None
+    following.description.continues = failed.name
+    following.description.write(following.path)
+    merge([failed, Session(following.path)], tmp_path / "both")
+    found = of_session(Session(tmp_path / "both"))
+    assert (found.lost, verify(Session(tmp_path / "both")).missing_count) == (lost, lost)
+
+
 def test_sessions_of_two_fleets_are_refused(whole: Session, tmp_path: Path) -> None:
     cut(whole, tmp_path / "other", EVERYTHING)
     info = session_dir.SessionInfo.read(tmp_path / "other")
