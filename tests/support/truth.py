@@ -43,7 +43,7 @@ def car_in(mode: Mode, world: str, *, seed: int, platform: str = "arduino") -> P
         pair.run(2.0 * moments.random())
         pair.ask(SetMode(mode))
         pair.until(lambda: pair.car.truth.mode is mode, 8.0)
-        pair.run(4.0)
+        pair.run(6.0)
     elif pair.control.driver.model.basis != "shown":
         pair.run(RENEWED_S)
     pair.run(2.0 * moments.random())

@@ -35,6 +35,8 @@ class ArduinoCar(ModeCar):
         self._arriving = ""
         """The frame that is arriving, in a car with `last_frame_wins`: there a `$` restarts the string."""
         self._speed = START_SPEED
+        self._prints_from = -inf
+        """The time from which the open mode prints its readings."""
         # The program counts turns of its loop, so these times stand still while it blocks. The frames of the options
         # are sent between the reports, so that none of them has to wait for room in the transmit buffer.
         self._due: dict[str, float] = {}
@@ -119,6 +121,7 @@ class ArduinoCar(ModeCar):
         # Row "a mode opened while driving": nothing here touches the motors.
         beeps = BEEP_S + 0.2 * (int(digit) + 1) if digit in MODE_OF_DIGIT else 0.0
         yield from self._busy(beeps + OPEN_S)
+        self._prints_from = self._now + self._traits.first_reading_s
 
     def _general_frame(self, text: str) -> Program:
         """Set the motion last, after everything that blocks, as in the real program."""
@@ -214,7 +217,7 @@ class ArduinoCar(ModeCar):
         frame = self._frame(fields)
         if self._mode is Mode.FOLLOWING:
             frame = frame[:-1]  # row "6 following": no `#`
-        if self._fan or self._is_silent or not self._traits.readings:
+        if self._fan or self._is_silent or not self._traits.readings or self._now < self._prints_from:
             yield Wait(self._now + len(frame) / self._rate)
         else:
             yield from self._print(frame)

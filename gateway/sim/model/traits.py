@@ -14,6 +14,10 @@ from schemas.words import Mode
 ECHO_RANGING_S: Final = 0.011
 """Time of one ranging with an echo, which is part of the interval between two reports."""
 
+# Measured: 1.69 s in tracking, 1.6 s in light seeking. Assumed in following.
+SIM_FIRST_READING_S: Final = 1.62
+"""Time from the end of the opening of a mode until the program prints in it. The motors run meanwhile."""
+
 
 class CarTraits(Struct, frozen=True):
     """The parameters of one car. The defaults are those of the simulated Arduino car."""
@@ -29,6 +33,8 @@ class CarTraits(Struct, frozen=True):
     """True if a hardware timer sends the reports, so that no frame delays them."""
     close_s: float = 1.0
     """Time for which `MODEx0` blocks the program."""
+    first_reading_s: float = SIM_FIRST_READING_S
+    """Time from the end of the opening of a mode to the first reading in it (not of the STM32 program)."""
     last_frame_wins: bool = False
     """True if only the last of several whole frames in the buffer counts. Then a `$` restarts the string."""
     silent_modes: frozenset[Mode] = frozenset()

@@ -10,7 +10,7 @@ from typing import Final
 from msgspec import Struct, field
 
 from gateway.drivers.yahboom.estimate.learned import Learned
-from gateway.drivers.yahboom.protocol.modes import SILENT_MODES, candidate_modes
+from gateway.drivers.yahboom.protocol.modes import MODES, SILENT_MODES, candidate_modes
 from gateway.drivers.yahboom.protocol.platforms import Profile
 from gateway.drivers.yahboom.protocol.sensors import Sensors
 from gateway.drivers.yahboom.protocol.timing import FRAME_S, MODE_CLOSE_S, REPEAT_INTERVAL_S, SERVO_S
@@ -267,7 +267,9 @@ class ModeEstimator(Struct):
             self._conclude(Verdict.ASSUMED, f"silent for {silent_s:.0f} s, {why}", now)
 
     def _silence_s(self, heard_at: float, now: float) -> float:
-        since = max(heard_at, self._in_mode_by, self._excused_at)
+        # The motors of a mode run for a while before its first reading, so that silence shows nothing.
+        first_s = 0.0 if self.asked is None else MODES[self.asked].first_reading_s
+        since = max(heard_at, self._in_mode_by + first_s, self._excused_at)
         # Do not count blocks that are much older than the last reading: the car had obeyed those frames before it began
         # that reading, which takes up to 1.0 s of ranging.
         return now - since - sum(block_s for at, block_s in self._blocks if at > since - REPEAT_INTERVAL_S)

@@ -20,7 +20,8 @@ class ModeRow(Struct, frozen=True):
     """The facts of docs/reference/protocol.md#modes about one mode.
 
     `digit` is the x of `MODE<x><y>`. `open_s` is the time for which opening the mode blocks the car. `turn_s` is the
-    longest block of one turn of the mode's own loop. `rate_hz` is the maximum number of sensors frames per second.
+    longest block of one turn of the mode's own loop. `first_reading_s` is the longest time from the end of the opening
+    to the first reading, while the motors already run. `rate_hz` is the maximum number of sensors frames per second.
     `measures` lists the measurements in a frame of this mode, even if only other programs than the vendor's print such
     a frame.
     """
@@ -34,6 +35,7 @@ class ModeRow(Struct, frozen=True):
     """Matches a frame whose other fields are this mode's filler. None if the mode has no filler of its own."""
     has_end: bool = True
     """True if the frame ends with `#`."""
+    first_reading_s: float = 0.0
 
     @property
     def is_silent(self) -> bool:
@@ -50,6 +52,9 @@ def _signature(filler: Mapping[str, bytes]) -> re.Pattern[bytes]:
     return re.compile(sensors_pattern(filler) + b"#?")
 
 
+# Measured: 1.69 s in tracking, 1.6 s in light seeking. Assumed in following (docs/reference/protocol.md#rates).
+FIRST_READING_S: Final = 1.7
+
 # The spelling of the filler tells the modes apart (docs/reference/protocol.md#placeholders).
 _TRACKING: Final = {"range": b"0", "battery": b"8", "grayscale": b"0", "obstacle": b"00", "light": b"00"}
 _SEEKING: Final = {"range": b"120", "battery": b"8.3", "grayscale": b"000", "line": b"0000", "obstacle": b"00"}
@@ -64,12 +69,25 @@ MODES: Final[Mapping[Mode, ModeRow]] = {
     Mode.MANUAL: ModeRow(0, 0.0, 1.0, rate_hz=1.0, measures=EVERY_MEASUREMENT),
     # docs/reference/protocol.md has no turn time for this mode: assumed as in the modes that only read pins
     Mode.REMOTE_CONTROL: ModeRow(1, _open_s(1), 0.1),
-    Mode.TRACKING: ModeRow(2, _open_s(2), 0.12, 27.0, frozenset({"line"}), _signature(_TRACKING)),
+    Mode.TRACKING: ModeRow(
+        2, _open_s(2), 0.12, 27.0, frozenset({"line"}), _signature(_TRACKING), first_reading_s=FIRST_READING_S
+    ),
     # near an obstacle, a turn takes 4.3 s; without any echo it never ends, and the motors are braked
     Mode.OBSTACLE_AVOIDANCE: ModeRow(3, _open_s(3), 4.3, measures=frozenset({"range"}), signature=_AVOIDING),
     Mode.COLOR_LED: ModeRow(4, _open_s(4), 0.75),
-    Mode.LIGHT_SEEKING: ModeRow(5, _open_s(5), 0.11, 23.0, frozenset({"light"}), _signature(_SEEKING)),
-    Mode.FOLLOWING: ModeRow(6, _open_s(6), 0.1, 24.0, frozenset({"obstacle"}), _signature(_FOLLOWING), has_end=False),
+    Mode.LIGHT_SEEKING: ModeRow(
+        5, _open_s(5), 0.11, 23.0, frozenset({"light"}), _signature(_SEEKING), first_reading_s=FIRST_READING_S
+    ),
+    Mode.FOLLOWING: ModeRow(
+        6,
+        _open_s(6),
+        0.1,
+        24.0,
+        frozenset({"obstacle"}),
+        _signature(_FOLLOWING),
+        has_end=False,
+        first_reading_s=FIRST_READING_S,
+    ),
 }
 
 SILENT_MODES: Final = frozenset(mode for mode, row in MODES.items() if row.is_silent)

@@ -36,7 +36,7 @@ def test_mode_car_told_without_modes_is_stopped() -> None:
     pair = Pair(told="raspberry_pi", start_s=2.0).ready()
     pair.car.feed(b"$4WD,MODE21#", pair.now)
     pair.until(lambda: pair.car.truth.mode is Mode.TRACKING, 3.0)
-    pair.until(lambda: pair.control.driver.model.motors == "unknown", 3.0)
+    pair.until(lambda: pair.control.driver.model.motors == "unknown", 5.0)
     assert pair.control.driver.model.motion is None
     answer = pair.ask(Stop(), identity="stop")
     asked_at = pair.now

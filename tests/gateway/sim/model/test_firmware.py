@@ -13,7 +13,7 @@ from gateway.sim.model.firmware_base import CarBodyState, Pose, Truth
 from gateway.sim.model.objects import Lamp
 from gateway.sim.model.raspberry_pi import RaspberryPiCar
 from gateway.sim.model.stm32 import STM32_TRAITS
-from gateway.sim.model.traits import CarTraits
+from gateway.sim.model.traits import SIM_FIRST_READING_S, CarTraits
 from gateway.sim.model.world import World
 from schemas.words import Mode
 from tests.gateway.sim.strangers import (
@@ -121,11 +121,23 @@ FILLER = [
 async def test_filler_and_rate_of_the_modes_that_talk(mode: int, frame: bytes, rate: float) -> None:
     car = virtual()
     await car.write(opening(mode))
-    await car.wait(opening_s(mode))
+    await car.wait(opening_s(mode) + SIM_FIRST_READING_S)
     data = await frames(car, 20)
     found = re.findall(frame, data)
     assert b"".join(found) == data[data.index(b"$") : data.index(b"$") + sum(map(len, found))]
     assert len(found) / 20 == pytest.approx(rate, rel=0.05)
+
+
+@pytest.mark.parametrize(("mode", "motors_s", "reading_s"), [(2, 2.71, 4.4), (5, 3.3, 4.9)])
+async def test_readings_of_a_mode_begin_long_after_its_motors(mode: int, motors_s: float, reading_s: float) -> None:
+    """As measured: docs/reference/protocol.md#programs-that-people-have."""
+    car = virtual(world=World(line=((-1.0, -1.3), (1.0, -1.3), (1.0, 1.3), (-1.0, 1.3)), lamps=[Lamp(0.3, -1.3)]))
+    await car.write(opening(mode))
+    await car.until(lambda truth: truth.driving)
+    assert car.now == pytest.approx(motors_s, abs=0.1)
+    car.received.clear()
+    await car.until(lambda _: bool(car.received))
+    assert car.now == pytest.approx(reading_s, abs=0.15)
 
 
 @pytest.mark.parametrize("mode", [1, 3, 4])
@@ -326,7 +338,7 @@ async def test_following_uses_infrared_with_inverted_bits() -> None:
         body = CarBody(wall, Pose(x, 0.0, 0.0), random.Random(1))
         car = VirtualStranger(ArduinoCar(body, random.Random(1)))
         await car.write(opening(6))
-        await car.wait(opening_s(6) + 0.5)
+        await car.wait(opening_s(6) + SIM_FIRST_READING_S + 0.1)
         assert word in car.received
         assert car.truth.driving == (word == b"HW00")
 

@@ -14,6 +14,7 @@ from gateway.sim.model.car_body import SONAR_REACH_CM, CarBody
 from gateway.sim.model.factory import build
 from gateway.sim.model.firmware_base import Firmware, Pose
 from gateway.sim.model.objects import Lamp, MovingObject
+from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
 from schemas.geometry import RADIUS_M, box, distance
 from tests.gateway.sim.strangers import RUN, VirtualStranger, opening, opening_s
@@ -39,8 +40,11 @@ def lit(lamp: Lamp, *, walls: bool = False, car: bool = False, thing: MovingObje
 
 
 def cars(world: World, *names: str) -> dict[str, Firmware]:
+    """Return cars that send readings from the opening of a mode on, so that tests see where they begin."""
+    traits = CarTraits(first_reading_s=0.0)
     return {
-        name: build("arduino", world, number, random.Random(number), name=name) for number, name in enumerate(names)
+        name: build("arduino", world, number, random.Random(number), name=name, traits=traits)
+        for number, name in enumerate(names)
     }
 
 
