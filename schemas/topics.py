@@ -151,7 +151,7 @@ CAR_TOPICS: Final = (
     Topic(
         "sensor/odometer",
         "fleet.v1.Odometer",
-        "distance that the wheels have covered since the car was switched on",
+        "way of the wheels since the car was switched on; it falls while they turn backwards",
         Qos.READING,
         20.0,
         _READING,

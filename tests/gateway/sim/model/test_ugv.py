@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.sim.model.factory import build_ugv
-from gateway.sim.model.ugv import UGV_BOOT_S, UGV_BUILDS, UGV_DEAD_MAN_S, WIFI_S, UgvCar
+from gateway.sim.model.ugv import UGV_BOOT_S, UGV_BUILDS, UGV_DEAD_MAN_S, UGV_RX_BUFFER, WIFI_S, UgvCar
 from gateway.sim.model.world import World
 
 
@@ -103,6 +103,8 @@ def test_ugv_half_is_full_power_on_open_loop() -> None:
 def test_without_encoders_the_speeds_are_nothing_or_the_command() -> None:
     host = Host("wave_rover").send('{"T":11,"L":200,"R":200}\n', '{"T":130}\n')
     assert host.feedback()["L"] == 200
+    host.send('{"T":130}\n')
+    assert (host.feedback()["L"], host.car.moving) == (0, True), "the command, only in the turn that obeys it"
     host.send(FORWARD).run(0.5).send('{"T":130}\n')
     assert (host.feedback()["L"], host.car.moving) == (0, True)
 
@@ -201,3 +203,114 @@ def test_ugv_missing_gimbal_slows_feedback() -> None:
     host.heard = b""
     assert host.run(2.0).heard.count(b'{"T":1001') in (9, 10, 11)
     assert host.heard.count(b'{"T":1005') == pytest.approx(20, abs=2)
+
+
+@pytest.mark.parametrize("platform", ["wave_rover", "ugv_rover"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"T":1e999}',
+        '{"T":"1e999"}',
+        '{"T":1,"L":NaN,"R":0}',
+        '{"T":1,"L":1e999,"R":1e999}',
+        '{"T":4,"cmd":1e999}',
+        '{"T":11,"L":1e999,"R":-1e999}',
+        '{"T":13,"X":1e999,"Z":1e999}',
+        '{"T":111,"cmd":1e999}',
+        '{"T":132,"IO4":1e999,"IO5":1e999}',
+        '{"T":900,"main":1e999,"module":-1e999}',
+        "[" * 250,
+    ],
+)
+def test_ugv_survives_any_number(platform: str, line: str) -> None:
+    host = Host(platform).send(f"{line}\n").run(0.5).send('{"T":1,"L":0,"R":0}\n', '{"T":130}\n').run(2.0)
+    assert (host.feedback()["T"], host.car.truth.alive) == (1001, True)
+
+
+@pytest.mark.parametrize("what", ['{"T":111,"cmd":2000}\n', '{"T":404}\n'])
+def test_stop_behind_a_blocking_line_waits_for_the_block(what: str) -> None:
+    host = Host("wave_rover").send(FORWARD).run(0.5).send(f'{what}{{"T":1,"L":0,"R":0}}\n').run(1.5)
+    assert host.car.moving
+    assert not host.run(WIFI_S).car.moving
+
+
+def test_ugv_stop_is_lost_if_the_buffer_is_full() -> None:
+    host = Host("ugv_rover").send('{"T":136,"cmd":-1}\n', FORWARD, '{"T":111,"cmd":2000}\n')
+    for _ in range(UGV_RX_BUFFER // len(FORWARD)):
+        host.send(FORWARD)
+    assert host.send('{"T":1,"L":0,"R":0}\n').run(5.0).car.moving
+    assert host.car.lost_bytes > 0
+
+
+def test_byte_in_the_buffer_ends_a_mission_at_once() -> None:
+    host = Host("wave_rover").send('{"T":242,"name":"dance"}\n' + FORWARD).run(0.5)
+    assert host.car.moving
+
+
+def test_too_great_numbers_turn_the_speed_loop_on() -> None:
+    host = Host("ugv_rover").send('{"T":11,"L":200,"R":200}\n').run(0.3).send('{"T":1,"L":9,"R":9}\n').run(1.0)
+    assert not host.car.moving, "the speed loop still has its old speed, which is 0"
+
+
+def test_doubled_speed_is_ignored_if_the_scale_is_a_half() -> None:
+    host = Host("ugv_rover").send('{"T":138,"L":0.5,"R":0.5}\n', '{"T":1,"L":0.2,"R":0.2}\n').run(1.5)
+    before = host.duty
+    host.send('{"T":1,"L":0.4,"R":0.4}\n').run(1.5)
+    assert host.duty == pytest.approx(before, abs=15)
+    assert not host.send('{"T":1,"L":0,"R":0}\n').run(1.0).car.moving
+
+
+def test_gains_that_are_missing_keep_the_power() -> None:
+    host = Host("ugv_rover").send(FORWARD).run(1.0).send('{"T":2}\n', '{"T":1,"L":0,"R":0}\n').run(1.0)
+    assert host.car.moving
+    assert not host.send('{"T":11,"L":0,"R":0}\n').run(1.0).car.moving
+
+
+def test_pins_are_low_until_the_speed_loop_sets_them_again() -> None:
+    host = Host("ugv_rover").send('{"T":11,"L":200,"R":200}\n').run(0.5).send('{"T":115}\n').run(0.5)
+    assert not host.car.moving
+    assert host.send(FORWARD).run(0.5).send('{"T":115}\n').run(0.5).car.moving
+
+
+def test_odometer_counts_back() -> None:
+    host = Host("ugv_rover").send(FORWARD).run(2.0).send('{"T":1,"L":-0.2,"R":-0.2}\n').run(2.5)
+    host.send('{"T":1,"L":0,"R":0}\n').run(1.0)
+    assert abs(host.feedback()["odl"]) < 20
+    host.send('{"T":1,"L":-0.2,"R":-0.2}\n').run(2.5)
+    assert host.feedback()["odl"] < -20
+
+
+def test_wrong_chassis_measures_other_speeds() -> None:
+    host = Host("ugv_rover").send('{"T":900,"main":1,"module":0}\n', FORWARD).run(2.0)
+    true_m_s = 0.5 * host.duty[0] / 255
+    assert true_m_s > 0.45, "it counts 660 pulses where it expects 2100, so it drives three times as fast"
+    assert host.feedback()["L"] == pytest.approx(0.2 * true_m_s / 0.5, abs=0.1)
+
+
+def test_slow_wheel_often_reports_nothing() -> None:
+    host = Host("ugv_rover").send('{"T":1,"L":0.02,"R":0.02}\n').run(2.5)
+    host.heard = b""
+    for _ in range(5):
+        host.send('{"T":1,"L":0.02,"R":0.02}\n').run(0.5)
+    found = [json.loads(each)["L"] for each in host.heard.split(b"\r\n") if each.startswith(b'{"T":1001')]
+    assert 0.1 < found.count(0) / len(found) < 0.9
+    assert min(each for each in found if each > 0) > 0.03
+
+
+def test_early_byte_skips_the_stored_chassis() -> None:
+    host = Host("ugv_beast").send('{"T":900,"main":3,"module":0}\n')
+    for early, wrong in (("", False), ("\n", True)):
+        host.car.brown_out(host.now)
+        host.run(1.0).send(early).run(UGV_BOOT_S + 0.5).send(FORWARD).run(0.3)
+        assert (host.car.wrong_since is not None) is wrong
+        assert host.car._wheels[0] < 0 if wrong else host.car._wheels[0] > 0
+
+
+def test_boot_and_ros_chassis_print_the_mission() -> None:
+    host = Host("ugv_beast").send('{"T":900,"main":3,"module":0}\n')
+    assert b"new mm_json appended." in host.heard
+    host.heard = b""
+    host.car.brown_out(host.now)
+    host.run(UGV_BOOT_S + 0.5)
+    assert b'[StepNum: 1 ] - {"T":900,"main":3,"module":0}\r\n' in host.heard
+    assert b"[missionPlay finished.]\r\n" in host.heard
