@@ -101,6 +101,12 @@ ON_ITS_WAY_S: Final = 2.0
 """Maximum time that a line of ours takes to reach the car over a slow link."""
 STUCK_S: Final = 1.0
 """Maximum time for which a wheel may stand still in a drive: twice the time that the speed loop takes to full power."""
+STUCK_M: Final = 0.05
+"""Distance at the commanded speed for which a slow wheel may stand still, if that takes longer than STUCK_S.
+
+The speed loop adds power in proportion to this distance: at 0.012 m it begins to turn the wheel, at 0.05 m it has 40 %
+of full power. And the car measures a speed by the pulses in one turn of its loop, so a slow wheel often reports 0.
+"""
 VOLTAGE_S: Final = 1.0
 """Interval at which an unchanged voltage is published. Feedbacks repeat the last measured voltage for up to 10 s."""
 ECHO_S: Final = 2.0
@@ -195,7 +201,8 @@ class WaveshareDriver(PlainDriver):
         """The last line of each try of this stop, until the car has repeated one of them."""
         self._stands_since: float | None = None
         self._stands = 0
-        self._stuck_since: float | None = None
+        self._turned_at: list[float | None] = [None, None]
+        """When each wheel was last seen to turn in this drive, or has begun to stand. None if it does not have to."""
         self._odometer_m: tuple[float, float] | None = None
         self._voltage: tuple[float, float] = (0.0, float("-inf"))
         """The last published voltage, and the time of its publication."""
@@ -388,23 +395,26 @@ class WaveshareDriver(PlainDriver):
 
     def _check_stuck(self, event: Feedback, now: float) -> None:
         """End a drive in which a wheel stands still, because the speed control adds power until the wheel turns."""
-        held, model = self.queue.held, self._model
-        turning: list[bool] = []  # stays empty if no wheel has to turn
-        if model.motors is Motors.ON and held is not None and held.began_at is not None:
+        held = self.queue.held
+        if self._model.motors is not Motors.ON or held is None or held.began_at is None:
+            self._turned_at = [None, None]
+            return
+        standing = []
+        for side, (speed, wanted) in enumerate(
+            zip((event.left_m_s, event.right_m_s), self._speeds(held.motion), strict=True)
+        ):
             # In a slow curve, the inner wheel shall turn no faster than a wheel that counts as turning.
-            speeds = zip((event.left_m_s, event.right_m_s), self._speeds(held.motion), strict=True)
-            turning = [abs(speed) >= min(TURNS_M_S, abs(wanted) / 2) for speed, wanted in speeds]
-        if all(turning):
-            self._stuck_since = None
-            return
-        self._stuck_since = now if self._stuck_since is None else self._stuck_since
-        if now < self._stuck_since + STUCK_S:
-            return
-        self._stuck_since = None
-        sides = " and ".join(side for side, turns in zip(("left", "right"), turning, strict=True) if not turns)
-        words = f"{model.name} is stopped: its {sides} wheel stood still. Is it blocked, or an encoder loose?"
-        self._log.log(Level.WARNING, "wheel_stands", words, now)
-        self.release(Phase.FAILED, Reason.STUCK, words, now)
+            turned_at = self._turned_at[side]
+            if turned_at is None or abs(speed) >= min(TURNS_M_S, abs(wanted) / 2):
+                self._turned_at[side] = now
+            elif now >= turned_at + max(STUCK_S, STUCK_M / max(abs(wanted), TURNS_M_S / 10)):
+                standing.append(("left", "right")[side])
+        if standing:
+            self._turned_at = [None, None]
+            words = f"{self._model.name} is stopped: its {' and '.join(standing)} wheel stood still. "
+            words += "Is it blocked, or an encoder loose?"
+            self._log.log(Level.WARNING, "wheel_stands", words, now)
+            self.release(Phase.FAILED, Reason.STUCK, words, now)
 
     # ------------------------------------------------------------------ set-up
 
