@@ -10,7 +10,7 @@ from collections.abc import Generator
 from math import inf
 from typing import Final
 
-from gateway.sim.model.firmware_base import COLOR_S, WHISTLE_S, Program, Wait, motion
+from gateway.sim.model.firmware_base import COLOR_BLOCK_S, WHISTLE_BLOCK_S, Program, Wait, motion
 from gateway.sim.model.mode_car import ARDUINO_LIGHTS, MODE_OF_DIGIT, ModeCar, to_int
 from schemas.words import Mode
 
@@ -127,7 +127,7 @@ class ArduinoCar(ModeCar):
         """Set the motion last, after everything that blocks, as in the real program."""
         left, right = motion(text)
         if text[5:6] == "1":
-            yield from self._busy(WHISTLE_S)
+            yield from self._busy(WHISTLE_BLOCK_S)
         if text[7:8] == "1":
             self._faster()
         elif text[7:8] == "2":
@@ -166,7 +166,7 @@ class ArduinoCar(ModeCar):
                     old[1] if green is None else green,
                     blue,
                 )
-                yield from self._busy(COLOR_S)
+                yield from self._busy(COLOR_BLOCK_S)
                 return True
         return self._set_joints(text)
 

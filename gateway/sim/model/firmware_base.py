@@ -25,9 +25,10 @@ BYTES_PER_S: Final = 960.0
 CHUNK: Final = 20
 """Maximum number of bytes in a piece, as from a Bluetooth 4.0 module."""
 
-WHISTLE_S: Final = 0.30
-SERVO_S: Final = 0.65
-COLOR_S: Final = 0.10
+# As measured on the vendor's Arduino program (docs/reference/protocol.md#programs-that-people-have).
+WHISTLE_BLOCK_S: Final = 0.304
+SERVO_BLOCK_S: Final = 0.637
+COLOR_BLOCK_S: Final = 0.101
 # The vendor's Arduino program was measured at about 0.68 s. The 1.0 s of docs/reference/protocol.md is the worst case.
 NO_ECHO_S: Final = 1.0
 ECHO_S_PER_CM: Final = 58e-6
@@ -338,13 +339,13 @@ class Firmware:
     def _busy(self, seconds: float) -> Program:
         """Block the program. `truth` shows a block of 0.1 s or more."""
         outer = self._blocked
-        self._blocked = outer or seconds >= COLOR_S
+        self._blocked = outer or seconds >= COLOR_BLOCK_S
         yield Wait(self._now + seconds)
         self._blocked = outer
 
     def _turn_servo(self, degrees: int) -> Program:
         self._servo = min(180, max(0, degrees))
-        yield from self._busy(SERVO_S)
+        yield from self._busy(SERVO_BLOCK_S)
 
     def _send(self, data: bytes) -> None:
         """Queue bytes on the wire to the host."""

@@ -9,9 +9,9 @@ from math import inf
 from typing import ClassVar, Final
 
 from gateway.sim.model.firmware_base import (
-    COLOR_S,
+    COLOR_BLOCK_S,
     NO_ECHO_S,
-    WHISTLE_S,
+    WHISTLE_BLOCK_S,
     CarBodyState,
     Firmware,
     Program,
@@ -148,7 +148,7 @@ class ModeCar(Firmware):
             case None:
                 pass
             case Button.WHISTLE:
-                yield from self._busy(WHISTLE_S)
+                yield from self._busy(WHISTLE_BLOCK_S)
             case Button.FASTER:
                 self._faster()
             case Button.SLOWER:
@@ -202,7 +202,7 @@ class ModeCar(Firmware):
         yield from self._turn_servo(self._color_position)
         red, green, blue = (int(self._rng.random() * 255) for _ in range(3))
         self._rgb = (red, green, blue)
-        yield from self._busy(COLOR_S)
+        yield from self._busy(COLOR_BLOCK_S)
         self._color_position = (self._color_position + 10) % 190
 
     def _avoidance(self) -> Program:

@@ -7,8 +7,8 @@ from typing import Final
 
 from gateway.sim.model.firmware_base import (
     BYTES_PER_S,
-    COLOR_S,
-    WHISTLE_S,
+    COLOR_BLOCK_S,
+    WHISTLE_BLOCK_S,
     CarBodyState,
     Firmware,
     Program,
@@ -23,7 +23,8 @@ TCP_RECEIVE: Final = 128
 """Maximum number of bytes in one call of receive."""
 SOCKET_BUFFER: Final = 65536
 TTY_BUFFER: Final = 4096
-START_PERCENT: Final = 80
+TCP_START_PERCENT: Final = 80
+SERIAL_START_PERCENT: Final = 50
 FAN_S: Final = 1.0
 LIGHT_S: Final = 0.02
 PI_BOOT_S: Final = 2.0
@@ -81,7 +82,7 @@ class RaspberryPiCar(Firmware):
     def _reset_variables(self) -> None:
         self._cache = ""
         self._in_frame = False
-        self._speed = START_PERCENT
+        self._speed = TCP_START_PERCENT if self._tcp else SERIAL_START_PERCENT
         self._cycle = 0
         self._turning: tuple[str, int, float] | None = None
         self._client = False
@@ -165,7 +166,7 @@ class RaspberryPiCar(Firmware):
             servo = self._servo_deg(_number(text, "PTZ", "#"))
         if "CLR" in text:
             self._rgb = (_number(text, "CLR", ",CLG"), _number(text, "CLG", ",CLB"), _number(text, "CLB", "#"))
-            yield from self._busy(COLOR_S)
+            yield from self._busy(COLOR_BLOCK_S)
         if "arm" in self._options and "ServoJ1" in text:
             ends = [*(f",J{n}" for n in range(2, 7)), "#"]
             self._joints = [min(180, _number(text, f"J{n}", end)) for n, end in enumerate(ends, 1)]
@@ -183,7 +184,7 @@ class RaspberryPiCar(Firmware):
             raise _Died  # the program reads place 9, here text[17], without checking that it exists
         left, right = motion(text)
         if text[5] == "1":
-            yield from self._busy(WHISTLE_S)
+            yield from self._busy(WHISTLE_BLOCK_S)
         if text[7] == "1":
             self._speed = min(100, self._speed + 20)
         elif text[7] == "2":
@@ -209,7 +210,7 @@ class RaspberryPiCar(Firmware):
         self._settle()
         axis, sign = _TURNS.get(digit, ("", 0))
         self._turning = (axis, sign, self._now) if axis else None
-        if digit in _RESETS:
+        if digit in _RESETS and not (self._tcp and digit == "8"):  # over TCP, 8 only stops both servos
             self._camera[_RESETS[digit]] = 90.0
 
     def _settle(self) -> None:

@@ -66,6 +66,33 @@ async def test_frame_sent_while_blocked_is_obeyed_later(what: str, frame: bytes,
     assert max(least, 19 / 960) - 0.03 <= took <= most + 0.06
 
 
+@pytest.mark.parametrize(
+    ("frame", "block_s"),
+    [
+        (MODE00, 1.000),
+        (WHISTLE, 0.304),
+        (PTZ90, 0.636),
+        (general(reset=1), 0.637),
+        (b"$4WD,CLR255,CLG0,CLB16#", 0.101),
+        (RUN, 0.0),
+        (general(light=3), 0.0),
+    ],
+)
+async def test_frame_delays_next_report_by_just_its_block(frame: bytes, block_s: float) -> None:
+    """As measured: docs/reference/protocol.md#programs-that-people-have."""
+    car = virtual(world=World([(1.3, -9.0, 1.3, 9.0)]))
+    ends = []
+    for number in range(4):
+        seen = car.received.count(b"#")
+        await car.until(lambda _, seen=seen: car.received.count(b"#") > seen)
+        ends.append(car.now)
+        if number == 1:
+            await car.wait(0.3)
+            await car.write(frame)
+    assert ends[2] - ends[1] == pytest.approx(1.254 + block_s, abs=0.003)
+    assert ends[3] - ends[2] == pytest.approx(1.254, abs=0.01)
+
+
 def test_opening_times_are_those_of_the_table() -> None:
     assert [round(opening_s(x), 1) for x in (1, 6)] == [2.5, 3.5]
 
@@ -90,7 +117,7 @@ async def test_motion_comes_after_whatever_else_in_the_frame_blocks() -> None:
     car = virtual()
     await car.write(general(motion=1, whistle=1, servo=1, reset=1))
     await car.until(lambda truth: truth.driving)
-    assert car.car.motor_log[-1][0] == pytest.approx(19 / 960 + 0.30 + 0.65 + 0.65)
+    assert car.car.motor_log[-1][0] == pytest.approx(19 / 960 + 0.304 + 0.637 + 0.637)
 
 
 async def test_raspberry_pi_fan_blocks_for_one_second() -> None:
@@ -215,14 +242,16 @@ async def test_wedged_arduino_string_is_bounded() -> None:
 
 
 SPEED = [
-    ("arduino", [150, 200, 250, 255, 255], [205, 155, 105, 55, 100, 50, 100]),
-    ("raspberry_pi", [204, 255, 255], [204, 153, 102, 51, 51]),
+    ("arduino", False, [150, 200, 250, 255, 255], [205, 155, 105, 55, 100, 50, 100]),
+    ("raspberry_pi", True, [204, 255, 255], [204, 153, 102, 51, 51]),
+    ("raspberry_pi", False, [128, 178, 230, 255, 255], [204, 153, 102, 51, 51]),
 ]
 
 
-@pytest.mark.parametrize(("platform", "up", "down"), SPEED)
-async def test_speed_is_relative_with_odd_steps(platform: str, up: list[int], down: list[int]) -> None:
-    car = virtual(platform)
+@pytest.mark.parametrize(("platform", "tcp", "up", "down"), SPEED)
+async def test_speed_is_relative_with_odd_steps(platform: str, tcp: bool, up: list[int], down: list[int]) -> None:
+    """The two programs of the Raspberry Pi begin at 80 and at 50 % (docs/reference/protocol.md#platforms)."""
+    car = virtual(platform, tcp=tcp)
     seen = [car.truth.speed]
     for _ in up[1:]:
         await car.write(general(motion=1, speed=1))
@@ -353,7 +382,7 @@ async def test_colour_led_mode_turns_every_three_quarters_of_a_second() -> None:
         start = car.now
         await car.until(lambda truth, led=led: truth.led != led)
         seen.append(car.now - start)
-    assert seen[1:] == pytest.approx([0.75] * 3, abs=0.01)
+    assert seen[1:] == pytest.approx([0.75] * 3, abs=0.02)
 
 
 async def test_avoidance_without_echo_is_braked_and_deaf_for_ever() -> None:
@@ -428,8 +457,10 @@ async def test_dropped_link_loses_bytes_and_leaves_half_frame() -> None:
     assert car.truth.driving  # row "half a general frame, then a stop"
 
 
-async def test_raspberry_pi_camera_turns_until_stopped() -> None:
-    car = virtual("raspberry_pi", tcp=True)
+@pytest.mark.parametrize("tcp", [True, False])
+async def test_raspberry_pi_camera_turns_until_stopped(tcp: bool) -> None:
+    """Over TCP, 8 resets nothing (docs/reference/protocol.md#general-frame)."""
+    car = virtual("raspberry_pi", tcp=tcp)
     assert isinstance(car.car, RaspberryPiCar)
     await car.write(general(servo=6))
     await car.wait(1)
@@ -440,7 +471,7 @@ async def test_raspberry_pi_camera_turns_until_stopped() -> None:
     assert car.car.camera["horizontal"] == pytest.approx(turned, abs=1)
     await car.write(general(servo=8))
     await car.wait(0.1)
-    assert car.car.camera["horizontal"] == 90
+    assert car.car.camera["horizontal"] == pytest.approx(turned if tcp else 90, abs=1)
 
 
 async def test_raspberry_pi_recovers_from_brown_out() -> None:
