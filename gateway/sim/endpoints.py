@@ -13,9 +13,16 @@ import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+from gateway.sim.model.line_rate import misread
 
 READ_SIZE = 128
+PORT_BAUD = 9600
+"""Rate of a port that no host has set, as Linux sets those of a serial adapter."""
+ODD_BAUD = 250_000
+"""Stands for a rate that the system has no constant for. No car has such a rate."""
+_RATE = re.compile(r"B[1-9]\d*")
 _TERMINAL = re.compile(r"/dev/(pts/|ttys)\d+")
 # A file system may store whole seconds only.
 _FILE_TIME_MARGIN_S = 2.0
@@ -86,9 +93,13 @@ class SimEndpoint(Protocol):
 
 
 class PtyEndpoint(SimEndpoint):
-    """A pseudo terminal; POSIX only."""
+    """A pseudo terminal; POSIX only.
 
-    def __init__(self, owner: Owner, path: str | None) -> None:
+    Its bytes have no rate, so it garbles them itself if the host sets another rate than that of the car, `baud`. If
+    `baud` is None, any rate is right.
+    """
+
+    def __init__(self, owner: Owner, path: str | None, baud: int | None = None) -> None:
         try:
             import pty
             import termios
@@ -101,6 +112,12 @@ class PtyEndpoint(SimEndpoint):
         self._setraw: Callable[[int], object] = tty.setraw
         self._tcflow: Callable[[int, int], object] = termios.tcflow
         self._flow_on, self._flow_off = termios.TCOON, termios.TCOOFF
+        self._attributes: Callable[[int], list[Any]] = termios.tcgetattr
+        self._set_attributes: Callable[[int, int, list[Any]], None] = termios.tcsetattr
+        self._set_now = termios.TCSANOW
+        # The numbers of its constants B9600, B115200 and so on belong to this system.
+        self._rates = {value: int(name[1:]) for name, value in vars(termios).items() if _RATE.fullmatch(name)}
+        self._baud = baud
         self._owner = owner
         self._path = Path(path) if path else None
         self._master = self._slave = -1
@@ -119,6 +136,7 @@ class PtyEndpoint(SimEndpoint):
         self._next = None
         # The slave stays open here, so that the terminal and its raw mode last while no host has it open.
         self._setraw(self._slave)
+        self._set_rate(PORT_BAUD)
         os.set_blocking(self._master, False)
         self._name = os.ttyname(self._slave)
         if self._path is not None:
@@ -172,7 +190,22 @@ class PtyEndpoint(SimEndpoint):
             return
         except OSError:  # macOS: the last host has closed the slave; wait for the next one
             return
-        self._owner.received(data)
+        self._owner.received(self._garbled(data, to_host=False))
+
+    def _set_rate(self, baud: int) -> None:
+        attributes = self._attributes(self._slave)
+        attributes[4] = attributes[5] = next(value for value, rate in self._rates.items() if rate == baud)
+        self._set_attributes(self._slave, self._set_now, attributes)
+
+    def _garbled(self, data: bytes, *, to_host: bool) -> bytes:
+        """Return what arrives of the bytes at the rate that the host has set."""
+        if self._baud is None or self._slave < 0:
+            return data
+        host = self._rates.get(self._attributes(self._slave)[4 if to_host else 5], ODD_BAUD)
+        if host == self._baud:
+            return data
+        sent_at, read_at = (self._baud, host) if to_host else (host, self._baud)
+        return misread(data, sent_at=sent_at, read_at=read_at)
 
     def stick(self, *, on: bool) -> None:
         """Stop or resume reading, and the terminal's output: while it is stopped, the host's writes block at once."""
@@ -209,7 +242,7 @@ class PtyEndpoint(SimEndpoint):
         """Send bytes. As on a UART, bytes that do not fit are lost."""
         if self._master >= 0:
             with contextlib.suppress(BlockingIOError, OSError):
-                os.write(self._master, data)
+                os.write(self._master, self._garbled(data, to_host=True))
 
     async def down(self) -> None:
         """Close both ends: a host sees an unplugged cable."""

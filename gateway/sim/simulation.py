@@ -23,6 +23,8 @@ from gateway.sim.model.ugv import UGV_BUILDS, UgvCar
 from gateway.sim.model.world import World
 from gateway.sim.world_commands import Change, WorldState, as_it_is
 
+CAR_BAUD: Final = 9600
+UGV_BAUD: Final = 115200
 MAX_WIRE_BYTES: Final = 128
 """Maximum bytes on a car's wire. Above it, the link stops reading from the host, so that memory is bounded."""
 
@@ -92,7 +94,7 @@ class SimCar:
         """Called when a lost link cannot be opened again."""
         self._link: SimEndpoint
         if isinstance(spec.link, PtyPath):
-            self._link = PtyEndpoint(self, spec.link.path)
+            self._link = PtyEndpoint(self, spec.link.path, _baud(firmware))
         else:
             self._link = TcpEndpoint(self, spec.link.host, spec.link.port)
 
@@ -326,6 +328,13 @@ class SimCar:
             if self.url != self._known_as:
                 self._known_as = self.url
                 self.on_renamed(self)
+
+
+def _baud(firmware: Machine) -> int | None:
+    """Return the baud rate of a car's UART. A capture plays at any rate."""
+    if isinstance(firmware, CaptureCar):
+        return None
+    return UGV_BAUD if isinstance(firmware, UgvCar) else CAR_BAUD
 
 
 def _rng(seed: str) -> random.Random:

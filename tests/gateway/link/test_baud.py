@@ -6,36 +6,13 @@ import pytest
 
 from gateway.link import LinkUrl, parse_url
 from gateway.link.baud import MIN_BYTES, BaudWatch
+from gateway.sim.model.line_rate import misread
 from tests.gateway.link.peers import PtyPeer
 from tests.support.ports import free_endpoint
 from tests.support.processes import FleetProcesses, wait_for
 
 REPORT = b"$4WD,CSB125,PV8.3,GS214,LF1011,HW01,GM10#"
 LINK = parse_url("/dev/ttyUSB0")
-
-
-def line_of(data: bytes) -> list[int]:
-    """Return the levels of a UART line, one for each bit: start bit, eight bits from the lowest on, stop bit."""
-    return [level for byte in data for level in (0, *(byte >> bit & 1 for bit in range(8)), 1)]
-
-
-def received(data: bytes, *, sent_at: int, read_at: int) -> bytes:
-    """Return what a UART reads at another rate: it samples the middle of each bit, and ignores a wrong stop bit."""
-    line, step = line_of(data), sent_at / read_at
-
-    def level(at: float) -> int:
-        return line[int(at)] if at < len(line) else 1
-
-    read, at = bytearray(), 0.0
-    while at < len(line):
-        if level(at) or level(at + step / 2):  # no start bit
-            at += step / 16
-            continue
-        read.append(sum(level(at + step * (1.5 + bit)) << bit for bit in range(8)))
-        at += step * 9.5
-        while at < len(line) and not level(at):  # the line must rest before the next start bit
-            at += step / 16
-    return bytes(read)
 
 
 def doubt(data: bytes, url: LinkUrl = LINK) -> tuple[str, str] | None:
@@ -46,12 +23,12 @@ def doubt(data: bytes, url: LinkUrl = LINK) -> tuple[str, str] | None:
 
 
 def test_baud_detection_reads_line_at_right_rate() -> None:
-    assert received(REPORT, sent_at=9600, read_at=9600) == REPORT
+    assert misread(REPORT, sent_at=9600, read_at=9600) == REPORT
 
 
 @pytest.mark.parametrize("rate", [38400, 57600, 115200])
 def test_port_that_is_too_fast_is_recognized(rate: int) -> None:
-    data = received(REPORT * 10, sent_at=9600, read_at=rate)
+    data = misread(REPORT * 10, sent_at=9600, read_at=rate)
     found = doubt(data, parse_url(f"serial:///dev/ttyUSB0?baud={rate}"))
     assert found is not None
     assert found[0] == "wrong_baud"
@@ -61,7 +38,7 @@ def test_port_that_is_too_fast_is_recognized(rate: int) -> None:
 
 @pytest.mark.parametrize(("car", "port"), [(115200, 9600), (57600, 9600), (9600, 4800), (9600, 19200)])
 def test_other_wrong_rates_are_doubted(car: int, port: int) -> None:
-    data = received(REPORT * 100, sent_at=car, read_at=port)
+    data = misread(REPORT * 100, sent_at=car, read_at=port)
     found = doubt(data, parse_url(f"serial:///dev/ttyUSB0?baud={port}"))
     assert found is not None
     assert found[0] == "no_frames"
@@ -111,7 +88,7 @@ def test_gateway_says_it(tmp_path: Path) -> None:
     try:
         gateway = started.gateway(f"{peer.url}?baud=115200")
         wait_for(lambda: "[link_open]" in gateway.stderr, "the port is open")
-        peer.send(received(REPORT * 10, sent_at=9600, read_at=115200))
+        peer.send(misread(REPORT * 10, sent_at=9600, read_at=115200))
         wait_for(lambda: (link := started.state("link")) and link.rejects["wrong_baud"] == 1, "it is counted")
         wait_for(lambda: "The port is at 115200 baud: cars use 9600. [no_frames]" in gateway.stderr, "it is said")
     finally:

@@ -78,6 +78,26 @@ async def test_pty_is_paced_at_9600_baud(pair: Simulation) -> None:
         assert time.monotonic() - begun >= 1500 / 960 - 0.2
 
 
+@pytest.mark.parametrize(("platform", "right"), [("arduino", 9600), ("ugv_rover", 115200)])
+async def test_host_at_wrong_baud_rate_understands_no_car(platform: str, right: int, tmp_path: Path) -> None:
+    simulation = Simulation(parse_cars([f"red:{platform}:pty:{tmp_path / 'red'}"]))
+    await simulation.start()
+    car = simulation.cars["red"]
+    drive = RUN if platform == "arduino" else b'{"T":1,"L":0.3,"R":0.3}\n'
+    data = bytearray()
+    with serial.Serial(str(tmp_path / "red"), 57600, timeout=0) as port:
+        for _ in range(3):
+            port.write(drive)
+        await until(lambda: data.extend(port.read(4096)) or len(data) > 100, "noise")
+        assert not {b"CSB", b'"T"'} & {bytes(data[at : at + 3]) for at in range(len(data))}
+        assert not car.truth.driving
+        port.baudrate = right
+        port.write(b"\n" + drive)
+        data.clear()
+        await until(lambda: data.extend(port.read(4096)) or (b"CSB" in data or b'"T":1001' in data), "words")
+    await simulation.stop()
+
+
 async def test_pty_firehose_is_held_back(pair: Simulation) -> None:
     car = pair.cars["red"]
     with serial.Serial(car.url.removeprefix("serial://"), write_timeout=0.2) as port:
