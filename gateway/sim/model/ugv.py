@@ -328,6 +328,7 @@ class UgvCar:
         self._counted_at = now
         self._next_turn = now + LOOP_S
         self._boot_until = now + UGV_BOOT_S
+        self._cut_outgoing(now)
         self._arrivals.clear()
         self._uart.clear()
         self._uart_from = now + UART_S
@@ -338,6 +339,16 @@ class UgvCar:
                 self._out.append((now + at, words))
             self._tx_free_at = now + _SETUP[-1][0]
             self._print_mission()
+
+    def _cut_outgoing(self, now: float) -> None:
+        """Lose what is not sent yet. The piece that is being sent ends in the middle."""
+        while self._out and self._out[-1][0] > now:
+            at, data = self._out.pop()
+            sent = int(len(data) - (at - now) * UGV_BYTES_PER_S)
+            if sent > 0:
+                self._out.append((now, data[:sent]))
+                break
+        self._tx_free_at = now
 
     def _boot_mission(self, at: float) -> list[tuple[float, str]]:
         """Return the steps of the boot mission with their times."""

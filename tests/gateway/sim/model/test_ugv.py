@@ -314,3 +314,15 @@ def test_boot_and_ros_chassis_print_the_mission() -> None:
     host.run(UGV_BOOT_S + 0.5)
     assert b'[StepNum: 1 ] - {"T":900,"main":3,"module":0}\r\n' in host.heard
     assert b"[missionPlay finished.]\r\n" in host.heard
+
+
+def test_reset_cuts_the_feedback_that_is_being_sent() -> None:
+    host = Host("ugv_rover").run(1.0)
+    while not host.car._out:
+        host.run(0.001)
+    host.heard = b""
+    host.run(0.003).car.brown_out(host.now)
+    host.run(1.0)
+    part, _, _ = host.heard.partition(b"ets ")
+    assert part.startswith(b'{"T":1001')
+    assert b"}" not in part, "only a part of it was on the wire"
