@@ -56,14 +56,22 @@ class BadOption(ValueError):
 def parse_traits(platform: str, options: Iterable[str]) -> CarTraits | None:
     """Return the traits of a car, or None if they are those of its platform. Raises BadOption for a wrong option."""
     if platform in UGV_BUILDS:
-        for option in options:
+        chosen = list(options)
+        for option in chosen:
             if option not in UGV_OPTIONS:
                 raise BadOption(f"option '+{option}' of {platform} is not allowed: use {allowed_options(platform)}")
+        if {"arm", "gimbal"} <= set(chosen):
+            raise BadOption(f"{platform} has an arm or a gimbal: use +arm or +gimbal")
         return None
     base = STM32_TRAITS if platform == Platform.STM32 else CarTraits()
     traits = base
+    given: set[str] = set()
     for option in options:
         traits = _with_option(traits, platform, option)
+        word, has_value, _ = option.partition("=")
+        if has_value and word in given and word != SILENT:
+            raise BadOption(f"option '+{word}' is given twice: give it once")
+        given.add(word)
     if traits.spread_s >= traits.interval_s:
         words = f"+spread={traits.spread_s:g} is not allowed: use less than the interval, {traits.interval_s:g} s"
         raise BadOption(f"option {words}")

@@ -71,10 +71,8 @@ def _read_lines(loop: asyncio.AbstractEventLoop, lines: "asyncio.Queue[bytes]") 
 async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
     try:
         fields = json.loads(line)
-        if isinstance(fields, dict) and fields.get("ask") == "truth":
-            return _truth(simulation, fields.get("car"))
-        if isinstance(fields, dict) and fields.get("ask") == "world":
-            return {"ok": True, **simulation.world_as_it_is()}
+        if isinstance(fields, dict) and "ask" in fields:
+            return _asked(simulation, fields)
         if isinstance(fields, dict) and ("lamp" in fields or "thing" in fields):
             simulation.change(change_of(fields, simulation.world))
             return {"ok": True, **{word: fields[word] for word in ("lamp", "thing") if word in fields}}
@@ -90,6 +88,18 @@ async def _answer(simulation: Simulation, line: bytes) -> dict[str, object]:
     except EndpointError as error:
         words = str(error)
     return {"ok": False, "error": words}
+
+
+def _asked(simulation: Simulation, fields: dict[str, object]) -> dict[str, object]:
+    """Return the answer to a question. Raises BadSpec if it is wrong."""
+    what = fields["ask"]
+    if what not in ("truth", "world"):
+        raise BadSpec(f"ask {what!r} is not allowed: use truth or world")
+    for word in fields.keys() - {"ask", "car"}:
+        raise BadSpec(f"field {word!r} is not allowed in ask: use car")
+    if what == "truth":
+        return _truth(simulation, fields.get("car"))
+    return {"ok": True, **simulation.world_as_it_is()}
 
 
 def _truth(simulation: Simulation, name: object) -> dict[str, object]:

@@ -151,7 +151,7 @@ def fault_of(fields: object) -> Fault:
     count, path = 0, given.get("path")
     if "bytes" in known:
         low, high = (0, MAX_CUT_BYTES) if kind is FaultKind.CUT_WRITE else (1, MAX_GARBAGE_BYTES)
-        count = int(number("bytes", given["bytes"], low, high))
+        count = _whole("bytes", given["bytes"], low, high)
     if path is not None and (not isinstance(path, str) or not path):
         raise BadSpec(f"path {path!r} is not allowed: write the new path of the symlink")
     ways = ["host", "car"] if kind is FaultKind.GARBAGE else list(_WAYS)
@@ -199,6 +199,12 @@ def _choice(what: str, value: object, allowed: list[str]) -> str:
     raise BadSpec(f"{what} {value!r} is not allowed: use {', '.join(allowed[:-1])} or {allowed[-1]}")
 
 
+def _whole(what: str, value: object, low: int, high: int) -> int:
+    if isinstance(value, float) and math.isfinite(value) and not value.is_integer():
+        raise BadSpec(f"{what} {value!r} is not allowed: use a whole number from {low} to {high}")
+    return int(number(what, value, low, high))
+
+
 def number(what: str, value: object, low: float, high: float) -> float:
     """Return a number from the control channel. Raises BadSpec if it is out of range."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
@@ -228,8 +234,9 @@ def parse_fault(text: str) -> Scheduled:
             raise BadSpec(f"fault {text!r} is not allowed: brownout takes no amount")
         fields["bytes" if match["word"] == FaultKind.GARBAGE else "for_s"] = float(match["amount"])
     try:
-        for part in filter(None, match["more"].split(",")):
+        for part in match["more"].split(",")[1:]:
             word, value = _field(part)
+            _refuse_second(word, fields)
             fields[word] = value
         return Scheduled(_at(match["at"]), fault_of(fields))
     except BadSpec as error:
@@ -252,6 +259,14 @@ def _at(text: str) -> float:
     if not math.isfinite(at) or at > MAX_FAULT_S:
         raise BadSpec(f"{text} s after the start is not allowed: use at most {MAX_FAULT_S:g}")
     return at
+
+
+def _refuse_second(word: str, fields: Mapping[str, object]) -> None:
+    """Raise BadSpec if the command line has given this field already, or must give it before the `@`."""
+    if word in ("car", "fault"):
+        raise BadSpec(f"field {word!r} is not allowed: write it before the @")
+    if word in fields:
+        raise BadSpec(f"{word} is given twice: give it once, as {word}=VALUE or after the +")
 
 
 def _field(text: str) -> tuple[str, object]:

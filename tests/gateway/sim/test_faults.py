@@ -67,6 +67,14 @@ BAD_SCHEDULES = [
     ("firehose@1,of=water", "noise or frame"),
     ("rename@1,path=7", "new path of the symlink"),
     ("stuck@1+99999", "0 to 86400"),
+    ("cut_write@1,bytes=7.5", "a whole number from 0 to 256"),
+    ("garbage@1+1.5", "a whole number from 1 to 100000"),
+    ("lossy@1,share=0.1,share=0.9", "share is given twice"),
+    ("link_drop@1+2,for_s=3", "for_s is given twice"),
+    ("garbage@1+20,bytes=30", "bytes is given twice"),
+    ("red:slow@1,car=blue", "field 'car' is not allowed"),
+    ("slow@1,fault=deaf", "field 'fault' is not allowed"),
+    ("slow@1,,factor=0.1", "FIELD=VALUE"),
 ]
 
 
@@ -86,6 +94,7 @@ BAD_FAULTS: list[tuple[object, str]] = [
     ({"fault": "link_drop", "for_s": float("nan")}, "0 to 86400"),
     ({"fault": "link_drop", "for_s": True}, "0 to 86400"),
     ({"fault": "garbage", "bytes": 10**9}, "1 to 100000"),
+    ({"fault": "garbage", "bytes": 2.5}, "a whole number from 1 to 100000"),
     ({"fault": "garbage", "to": "moon"}, "host or car"),
     ({"fault": "garbage", "car": 7}, "car 7"),
     ({"fault": "garbage", "to": "both"}, "host or car"),

@@ -368,6 +368,8 @@ def test_simulator_announces_cars_takes_faults_and_ends_clean(
     assert "'nobody'" in answer["error"]
     assert answer["error"].endswith("red, blue")
     assert not sim.ask(fault="melt")["ok"]
+    assert "use truth or world" in sim.ask(ask="thruth", car="red")["error"]
+    assert "'lamp'" in sim.ask(ask="world", lamp="beacon")["error"]
     assert sim.popen.stdin is not None
     sim.popen.stdin.write("no json\n")
     assert "not JSON" in sim.line()["error"]
