@@ -1,5 +1,4 @@
 """The driver of Waveshare's UGV family: WAVE ROVER, UGV01, UGV02, UGV Rover, UGV Beast. Pure.
 
-`feedback_parser` turns the lines of such a car into events, `ugv_platforms` is the table of its platforms, `driver`
-does the rest. docs/reference/waveshare.md has the facts about these cars, and their sources.
+`feedback_parser` reads lines, `ugv_platforms` is a table, `driver` does the rest. Facts: docs/reference/waveshare.md.
 """

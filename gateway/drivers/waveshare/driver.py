@@ -90,8 +90,7 @@ BLIND_TRIES: Final = 10
 """How often the settings are sent at most. SILENT_TRIES counts for a car that repeats no line, but whose feedback comes
 at the interval that we set, because that shows that our lines arrive. Otherwise BLIND_TRIES counts."""
 ECHO_TRIES: Final = 3
-"""Number of tries of a stop without an echo (a line of ours that the car repeats). After them, the echo counts as
-switched off."""
+"""Tries of a stop without an echo (a line of ours that the car repeats) after which the echo counts as switched off."""
 STANDS_S: Final = 0.25
 STANDS_REPORTS: Final = 3
 """Time, and number of feedbacks, for which the wheels must stand still to show a stop: two turns of the speed loop."""
@@ -102,11 +101,8 @@ ON_ITS_WAY_S: Final = 2.0
 STUCK_S: Final = 1.0
 """Maximum time for which a wheel may stand still in a drive: twice the time that the speed loop takes to full power."""
 STUCK_M: Final = 0.05
-"""Distance at the commanded speed for which a slow wheel may stand still, if that takes longer than STUCK_S.
-
-The speed loop adds power in proportion to this distance: at 0.012 m it begins to turn the wheel, at 0.05 m it has 40 %
-of full power. And the car measures a speed by the pulses in one turn of its loop, so a slow wheel often reports 0.
-"""
+"""A wheel may stand still until it should have turned so far, if that takes longer than STUCK_S. The speed loop adds
+power with this distance: from 0.012 m on the wheel turns, at 0.05 m it has 40 %. A slow wheel often reports 0."""
 VOLTAGE_S: Final = 1.0
 """Interval at which an unchanged voltage is published. Feedbacks repeat the last measured voltage for up to 10 s."""
 ECHO_S: Final = 2.0
@@ -201,8 +197,8 @@ class WaveshareDriver(PlainDriver):
         """The last line of each try of this stop, until the car has repeated one of them."""
         self._stands_since: float | None = None
         self._stands = 0
-        self._turned_at: list[float | None] = [None, None]
-        """When each wheel was last seen to turn in this drive, or has begun to stand. None if it does not have to."""
+        self._turned_at: dict[str, float] = {}
+        """When each wheel was last seen to turn in this drive, or when the drive began. Empty without a drive."""
         self._odometer_m: tuple[float, float] | None = None
         self._voltage: tuple[float, float] = (0.0, float("-inf"))
         """The last published voltage, and the time of its publication."""
@@ -395,24 +391,20 @@ class WaveshareDriver(PlainDriver):
 
     def _check_stuck(self, event: Feedback, now: float) -> None:
         """End a drive in which a wheel stands still, because the speed control adds power until the wheel turns."""
-        held = self.queue.held
+        held, standing = self.queue.held, []
         if self._model.motors is not Motors.ON or held is None or held.began_at is None:
-            self._turned_at = [None, None]
+            self._turned_at = {}
             return
-        standing = []
-        for side, (speed, wanted) in enumerate(
-            zip((event.left_m_s, event.right_m_s), self._speeds(held.motion), strict=True)
-        ):
+        wheels = zip(("left", "right"), (event.left_m_s, event.right_m_s), self._speeds(held.motion), strict=True)
+        for side, speed, wanted in wheels:
             # In a slow curve, the inner wheel shall turn no faster than a wheel that counts as turning.
-            turned_at = self._turned_at[side]
-            if turned_at is None or abs(speed) >= min(TURNS_M_S, abs(wanted) / 2):
+            if side not in self._turned_at or abs(speed) >= min(TURNS_M_S, abs(wanted) / 2):
                 self._turned_at[side] = now
-            elif now >= turned_at + max(STUCK_S, STUCK_M / max(abs(wanted), TURNS_M_S / 10)):
-                standing.append(("left", "right")[side])
+            elif now >= self._turned_at[side] + max(STUCK_S, STUCK_M / max(abs(wanted), TURNS_M_S / 10)):
+                standing.append(side)
         if standing:
-            self._turned_at = [None, None]
-            words = f"{self._model.name} is stopped: its {' and '.join(standing)} wheel stood still. "
-            words += "Is it blocked, or an encoder loose?"
+            self._turned_at, which = {}, " and ".join(standing)
+            words = f"{self._model.name} is stopped: its {which} wheel stood still. Is it blocked, or an encoder loose?"
             self._log.log(Level.WARNING, "wheel_stands", words, now)
             self.release(Phase.FAILED, Reason.STUCK, words, now)
 
