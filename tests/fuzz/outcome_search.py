@@ -1,15 +1,16 @@
 """Searches for outcomes of commands that are false, late or missing, as a client tells them to its user.
 
-An episode has one drawn car (`any_car.draw_car`), its control, and people who send it commands at any moment, also
-before the last ones have ended. Between control and the clients stand the real messages, and a bus that delays them.
-The frames that were written for a command, and the car's true motors, judge what the clients say.
+An episode has one drawn car of the first family (`any_car.draw_car`) or of the second, its control, and people who
+send it commands at any moment, also before the last ones have ended. Between control and the clients stand the real
+messages, and a bus that delays them. The frames that were written for a command, and the car's true motors, judge what
+the clients say.
 """
 
 import random
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
 from fleet.client import commands
 from fleet.client.commands import CommandRequest
@@ -18,15 +19,16 @@ from fleet.client.outcome_words import STOP_VERBS
 from gateway.bus import command_parser
 from gateway.bus.car_service import Request
 from gateway.control.control_output import CommandRecord, OutgoingFrame
+from gateway.control.controller import Controller
+from gateway.control.driver import Driver
 from schemas.commands import COMMANDS, Verb
 from schemas.topics import PROTOBUF
 from schemas.words import Basis, Light, Mode, Motion, Phase, Scope
-from tests.fuzz.any_car import DrawnCar, draw_car
+from tests.fuzz.any_car import draw_car
+from tests.fuzz.ugv_search import UgvEpisode
 from tests.support.stops import WORLDS
 from tests.support.virtual import Pair
 
-FALSE_S: Final = 0.3
-"""Maximum time for which a claim may be false."""
 CONNECT_S: Final = 20.0
 AFTER_S: Final = 60.0
 """Time after the last command, in which every outcome must come."""
@@ -58,19 +60,54 @@ class OutcomeReport:
     """Result of an episode."""
 
     seed: int
-    car: DrawnCar
+    car: str
     violations: list[str] = field(default_factory=list)
     outcomes: Counter[str] = field(default_factory=Counter)
     story: list[str] = field(default_factory=list)
 
 
-class Outcomes:
-    """Plays one episode."""
+class Stage(Protocol):
+    """A car and its control on virtual time."""
 
-    def __init__(self, seed: int) -> None:
-        moments = self._moments = random.Random(f"outcome {seed}")
+    control: Controller[Driver]
+    records: list[CommandRecord]
+    about: str
+
+    @property
+    def linked(self) -> bool:
+        """Return True if the link is open."""
+
+    @property
+    def now(self) -> float:
+        """The time, s."""
+
+    @property
+    def moves(self) -> bool:
+        """Return True if the motors run."""
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+
+    def write(self) -> None:
+        """Write the frames that are due."""
+
+    def connect(self) -> None:
+        """Open the link."""
+
+    def lose(self) -> None:
+        """Cut the link."""
+
+    def disturb(self, moments: random.Random) -> None:
+        """Let something happen to the car or its link."""
+
+
+class FirstFamily:
+    """A drawn car of the first family."""
+
+    def __init__(self, seed: int, moments: random.Random) -> None:
         car = draw_car(moments, modes=moments.random() < 0.7)
         world = moments.choices(["echo", "no-echo", "flickering"], [4, 1, 1])[0]
+        self.about = f"{car}, {world}"
         self.pair = Pair(
             car.platform,
             seed=seed,
@@ -79,15 +116,105 @@ class Outcomes:
             start_s=2.0,
             traits=car.traits if car.platform == "arduino" else None,
         )
-        self.told = OutcomeReport(seed, car)
-        self._people = [f"p{number}" for number in range(moments.choice([1, 1, 2, 3]))]
-        self._kinds = dict(zip(self._people, ("person", "person", "script"), strict=False))
+        self.control: Controller[Driver] = self.pair.control
+        self.records = self.pair.records
+        self.linked = False
+
+    @property
+    def now(self) -> float:
+        return self.pair.now
+
+    @property
+    def moves(self) -> bool:
+        return self.pair.car.truth.driving
+
+    def run(self, seconds: float) -> None:
+        self.pair.run(seconds, linked=self.linked)
+
+    def write(self) -> None:
+        self.pair._pump()
+
+    def connect(self) -> None:
+        self.pair.connect()
+        self.linked = True
+
+    def lose(self) -> None:
+        self.pair.lose()
+        self.linked = False
+
+    def disturb(self, moments: random.Random) -> None:
+        pair, chance = self.pair, moments.random()
+        if "feed" in pair.car.__dict__:
+            pair.pass_frames()
+        elif chance < 0.4:
+            pair.deaf_until = pair.now + moments.uniform(0.0, 6.0)
+        elif chance < 0.7:
+            pair.lose_frames()
+        else:
+            pair.car.brown_out(pair.now)
+
+
+class SecondFamily:
+    """A car of the second family."""
+
+    def __init__(self, seed: int, moments: random.Random) -> None:
+        self.episode = UgvEpisode(seed)
+        self.about = f"{self.episode.car_platform}, {sorted(self.episode.options)}"
+        self.control = self.episode.control
+        self.records = self.episode.records
+        self._moments = moments
+
+    @property
+    def linked(self) -> bool:
+        return self.episode.linked
+
+    @property
+    def now(self) -> float:
+        return self.episode.now
+
+    @property
+    def moves(self) -> bool:
+        return self.episode.car.moving
+
+    def run(self, seconds: float) -> None:
+        self.episode.run(seconds)
+        self.episode.faults.clear()  # `ugv_search` judges them
+
+    def write(self) -> None:
+        self.episode._turn()
+
+    def connect(self) -> None:
+        self.episode.connect()
+
+    def lose(self) -> None:
+        self.episode.cut()
+
+    def disturb(self, moments: random.Random) -> None:
+        episode = self.episode
+        if episode.loss:
+            episode.loss = 0.0
+        elif moments.random() < 0.5:
+            episode.loss = moments.choice((0.05, 0.3, 1.0))
+        else:
+            episode.car.brown_out(episode.now)
+
+
+class Outcomes:
+    """Plays one episode."""
+
+    def __init__(self, seed: int) -> None:
+        moments = self._moments = random.Random(f"outcome {seed}")
+        self.stage: Stage = SecondFamily(seed, moments) if seed % 5 == 4 else FirstFamily(seed, moments)
+        self.report = OutcomeReport(seed, self.stage.about)
+        self.people = [f"p{number}" for number in range(moments.choice([1, 1, 2, 3]))]
+        self._kinds = dict(zip(self.people, ("person", "person", "script"), strict=False))
         self._slow = moments.random() < 0.3
         """True if the bus is slow at times."""
         self._said: list[Said] = []
         self._seen = 0
-        self._linked = False
-        written = self.pair.control.driver.on_written
+        self._stood_at = 0.0
+        """When the motors were off last."""
+        written = self.stage.control.driver.on_written
 
         def on_written(write: OutgoingFrame, now: float) -> None:
             for said in self._said:
@@ -95,29 +222,29 @@ class Outcomes:
                     said.frames.append(now)
             written(write, now)
 
-        self.pair.control.driver.on_written = on_written  # type: ignore[method-assign]  # the wire has no ids
+        self.stage.control.driver.on_written = on_written  # type: ignore[method-assign]  # the wire has no ids
 
     def play(self) -> OutcomeReport:
         """Send commands at random moments, and wait for the outcome of each."""
-        pair, moments = self.pair, self._moments
-        pair.connect()
-        self._linked = True
-        for person in self._people:
-            pair.control.on_sender_token(person, alive=True, now=pair.now)
-        self._run(moments.choice([0.0, moments.uniform(0.0, 10.0), CONNECT_S]))
+        stage, moments = self.stage, self._moments
+        stage.connect()
+        for person in self.people:
+            stage.control.on_sender_token(person, alive=True, now=stage.now)
+        self.run(moments.choice([0.0, moments.uniform(0.0, 10.0), CONNECT_S]))
         for _ in range(moments.randrange(3, 12)):
-            self._ask(moments.choice(list(self._requests())))
-            self._run(
+            again = bool(self._said) and moments.random() < 0.2
+            self.ask(self._said[-1].request if again else moments.choice(list(self._requests())))
+            self.run(
                 moments.choice([0.0, moments.uniform(0.0, 0.5), moments.uniform(0.0, 4.0), moments.uniform(0.0, 20.0)])
             )
             self._disturb()
-        if not self._linked:
-            self._connect()
-        self._run(AFTER_S)
+        if not stage.linked:
+            stage.connect()
+        self.run(AFTER_S)
         for said in self._said:
             if said.progress.outcome is None:
-                self._violate(said, f"no outcome after {pair.now - said.asked_at:.1f} s")
-        return self.told
+                self._violate(said, f"no outcome after {stage.now - said.asked_at:.1f} s")
+        return self.report
 
     # ------------------------------------------------------------------ people
 
@@ -144,38 +271,38 @@ class Outcomes:
         yield commands.fan_request(moments.choice([None, "on", "off"]))
         yield commands.lease_request(take=moments.random() < 0.3, release=moments.random() < 0.3)
 
-    def _ask(self, request: CommandRequest) -> None:
+    def ask(self, request: CommandRequest) -> None:
         """Send a command of somebody, and put its answer on the bus."""
-        pair, moments = self.pair, self._moments
-        person = moments.choice(self._people)
+        stage, moments = self.stage, self._moments
+        person = moments.choice(self.people)
         identity = f"c{len(self._said) + 1}"
         progress = Progress(
-            "red", request.until, pair.now, request.duration_s, verb=request.effect_verb, detail=request.detail
+            "red", request.until, stage.now, request.duration_s, verb=request.effect_verb, detail=request.detail
         )
-        said = Said(identity, request, progress, pair.now)
+        said = Said(identity, request, progress, stage.now)
         self._said.append(said)
         message = type(request.message)()
         message.CopyFrom(request.message)
         message.id, message.sender, message.kind, message.take = identity, person, self._kinds[person], request.take
         encoding = f"{PROTOBUF};{COMMANDS[request.verb].message}"
-        before = len(pair.records)
+        before = len(stage.records)
         try:
             command = command_parser.parse(Request(request.verb, message.SerializeToString(), encoding), 0, car="red")
         except command_parser.BadRequest as error:
             self._violate(said, f"not parsed: {error.words}")
             return
-        answer = pair.control.command(command, pair.now)
-        pair._pump()
-        was_sent = any(each.command.id == identity and each.phase is Phase.SENT for each in pair.records[before:])
+        answer = stage.control.command(command, stage.now)
+        stage.write()
+        was_sent = any(each.command.id == identity and each.phase is Phase.SENT for each in stage.records[before:])
         status = Phase.SENT if was_sent and answer.status is Phase.QUEUED else answer.status
-        self.told.story.append(f"{said} by {person}: {status} {answer.words}")
+        self.report.story.append(f"{said} by {person}: {status} {answer.words}")
 
         def arrive() -> None:
             progress.on_answer(
-                str(status), str(answer.reason or ""), answer.words, answer.worst_case_s or 0.0, pair.now
+                str(status), str(answer.reason or ""), answer.words, answer.worst_case_s or 0.0, stage.now
             )
 
-        said.answer = pair.now + self._delay_s(), arrive
+        said.answer = stage.now + self._delay_s(), arrive
         self._take()
 
     def _delay_s(self) -> float:
@@ -185,53 +312,44 @@ class Outcomes:
 
     def _disturb(self) -> None:
         """Let something else happen, sometimes."""
-        pair, moments = self.pair, self._moments
+        stage, moments = self.stage, self._moments
         chance = moments.random()
-        if not self._linked:
+        if not stage.linked:
             if chance < 0.5:
-                self._connect()
+                stage.connect()
         elif chance < 0.03:
-            pair.lose()
-            self._linked = False
-        elif chance < 0.06:
-            pair.deaf_until = pair.now + moments.uniform(0.0, 6.0)
-        elif chance < 0.08:
-            pair.lose_frames()
+            stage.lose()
         elif chance < 0.10:
-            pair.car.brown_out(pair.now)
+            stage.disturb(moments)
         elif chance < 0.12:
-            person = moments.choice(self._people)
+            person = moments.choice(self.people)
             for alive in (False, True):
-                pair.control.on_sender_token(person, alive=alive, now=pair.now)
-        if chance > 0.5 and "feed" in pair.car.__dict__:
-            pair.pass_frames()
-
-    def _connect(self) -> None:
-        self.pair.connect()
-        self._linked = True
+                stage.control.on_sender_token(person, alive=alive, now=stage.now)
 
     # ------------------------------------------------------------------ time
 
-    def _run(self, seconds: float) -> None:
+    def run(self, seconds: float) -> None:
         """Let time pass, pass on what is on the bus, and judge each outcome when it is told."""
-        pair = self.pair
-        end = pair.now + seconds
-        while pair.now < end - 1e-9:
-            pair.run(min(STEP_S, end - pair.now), linked=self._linked)
+        stage = self.stage
+        end = stage.now + seconds
+        while stage.now < end - 1e-9:
+            stage.run(min(STEP_S, end - stage.now))
+            if not stage.moves:
+                self._stood_at = stage.now
             self._take()
             for said in self._said:
                 self._pass_on(said)
 
     def _take(self) -> None:
         """Put new records on the bus, as events."""
-        pair = self.pair
-        for record in pair.records[self._seen :]:
+        stage = self.stage
+        for record in stage.records[self._seen :]:
             for said in self._said:
                 if said.identity == record.command.id:
-                    at = pair.now + self._delay_s()
+                    at = stage.now + self._delay_s()
                     at = max(at, said.due[-1][0]) if said.due else at
                     said.due.append((at, self._event_of(said, record)))
-        self._seen = len(pair.records)
+        self._seen = len(stage.records)
 
     def _event_of(self, said: Said, record: CommandRecord) -> Callable[[], None]:
         def arrive() -> None:
@@ -240,14 +358,14 @@ class Outcomes:
                 str(record.reason or ""),
                 record.words,
                 record.worst_case_s,
-                self.pair.now,
+                self.stage.now,
                 str(record.basis),
             )
 
         return arrive
 
     def _pass_on(self, said: Said) -> None:
-        now = self.pair.now
+        now = self.stage.now
         if said.answer is not None and said.answer[0] <= now:
             said.answer[1]()
             said.answer = None
@@ -264,8 +382,8 @@ class Outcomes:
 
     def _judge(self, said: Said, outcome: Outcome) -> None:
         verb = said.request.verb
-        self.told.outcomes[f"{verb} {outcome.code or outcome.phase} {outcome.basis}"] += 1
-        self.told.story.append(f"{self.pair.now:.2f} {said.identity}: {outcome}")
+        self.report.outcomes[f"{verb} {outcome.code or outcome.phase} {outcome.basis}"] += 1
+        self.report.story.append(f"{self.stage.now:.2f} {said.identity}: {outcome}")
         if outcome.code in (NO_ANSWER, NO_RESULT):
             self._violate(said, f"nothing was lost on the bus, but: {outcome}")
         if outcome.phase in (Phase.REJECTED, Phase.EXPIRED) and said.frames and "frames were sent" not in outcome.words:
@@ -275,19 +393,11 @@ class Outcomes:
         if not str(outcome) or "{" in str(outcome):
             self._violate(said, f"text {str(outcome)!r}")
         stops = said.request.until is Until.STOPPED
-        if stops and outcome.ok and outcome.basis == Basis.SHOWN and not self._stood(said.asked_at):
+        if stops and outcome.ok and outcome.basis == Basis.SHOWN and self._stood_at < said.asked_at:
             self._violate(said, f"the motors ran all the time, but: {outcome}")
 
-    def _stood(self, since: float) -> bool:
-        """Return True if the motors were off at some moment since a time, less a tolerance."""
-        log = self.pair.car.motor_log
-        before = [(left, right) for at, left, right in log if at <= since]
-        return (not before or before[-1] == (0, 0)) or any(
-            (left, right) == (0, 0) for at, left, right in log if at > since
-        )
-
     def _violate(self, said: Said, words: str) -> None:
-        self.told.violations.append(f"{self.pair.now:.2f} {said}: {words}")
+        self.report.violations.append(f"{self.stage.now:.2f} {said}: {words}")
 
 
 def play(seed: int) -> OutcomeReport:

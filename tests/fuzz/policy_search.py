@@ -22,7 +22,7 @@ from fleet.policy.plan.plan import Plan
 from fleet.policy.plan.plan_parser import parse
 from fleet.policy.role_allocation import REFUSED_MODE_RETRY_S
 from fleet.policy.snapshot import CarSnapshot, FleetSnapshot, Refusal
-from fleet.policy.state import PolicyState, on_hub_back, restore, to_persisted
+from fleet.policy.state import FAILED_MODE_KEPT_S, PolicyState, on_hub_back, restore, to_persisted
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.messages import Observation
 from schemas.topics import TOPICS
@@ -40,6 +40,8 @@ MAX_COMMANDS: Final = 8
 STALE_S: Final = TOPICS["sensor/light"].stale_after_s or 0.0
 LASTS_S: Final = 30.0
 """Time in its mode after which earlier failures of a car are forgotten."""
+NOTICE_S: Final = 6.0
+"""Maximum time until a gateway finds out that its car is not in its mode."""
 PLANS: Final = tuple(
     parse(text)
     for text in (
@@ -136,7 +138,7 @@ class PolicyEpisode:
             deaf=moments.random() < 0.1,
             stop_s=moments.uniform(0.2, 5.0),
             report_s=moments.uniform(0.05, 2.8),
-            notice_s=moments.uniform(0.3, 6.0),
+            notice_s=moments.uniform(0.3, NOTICE_S),
         )
 
     # ------------------------------------------------------------------ time
@@ -385,7 +387,7 @@ class PolicyEpisode:
                 continue
             self.switches += 1
             mode = str(self.plan.roles[role].mode)
-            failed = [at for at, asked in car.asked if asked == mode and at > self.now - 2 * LASTS_S]
+            failed = [at for at, asked in car.asked if asked == mode and at > self.now - FAILED_MODE_KEPT_S - NOTICE_S]
             excused = (
                 car.seen.taken_by or car.seen.driven_by
                 or not car.seen.present or not car.seen.mode or car.gone

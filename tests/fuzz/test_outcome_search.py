@@ -3,8 +3,10 @@
 import pytest
 
 from fleet.client import outcome
+from fleet.client.commands import drive_request
 from gateway.control.controller import Controller
-from tests.fuzz.outcome_search import play
+from schemas.words import Motion
+from tests.fuzz.outcome_search import AFTER_S, CONNECT_S, Outcomes, play
 
 EPISODES = 250
 
@@ -17,15 +19,22 @@ def test_outcomes_of_250_cars_are_true_and_in_time() -> None:
     assert len(told) > 60, "kinds of outcomes"
 
 
-@pytest.mark.parametrize("seed", [1080, 1902])
-def test_blinking_that_has_begun_does_not_wait_for_a_stop(seed: int) -> None:
-    told = play(seed)
-    assert told.violations == []
-    assert told.outcomes["find sent "] >= 1
+def violations_of_an_extended_drive() -> list[str]:
+    """Extend a drive by more than a client waits beyond its end."""
+    episode = Outcomes(0)
+    episode.people = ["p0"]
+    episode.stage.connect()
+    episode.run(CONNECT_S)
+    episode.ask(drive_request(Motion.FORWARD, 1.0))
+    episode.run(0.5)
+    episode.ask(drive_request(Motion.FORWARD, 9.5))
+    episode.run(AFTER_S)
+    assert episode.report.outcomes.total() == 2
+    return episode.report.violations
 
 
 def test_drive_that_was_extended_has_an_end() -> None:
-    assert play(3371).violations == []
+    assert violations_of_an_extended_drive() == []
 
 
 def test_search_finds_a_client_that_gives_up_too_early(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,4 +45,4 @@ def test_search_finds_a_client_that_gives_up_too_early(monkeypatch: pytest.Monke
 
 def test_search_finds_a_drive_whose_end_nobody_tells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Controller, "_pass_drive_on", lambda self, _, new, how, now: self._done(new, how, now))
-    assert play(3371).violations
+    assert violations_of_an_extended_drive()

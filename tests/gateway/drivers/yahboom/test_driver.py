@@ -2,12 +2,12 @@
 
 import pytest
 
-from gateway.control.commands import Action, AimServo, ChangeSpeed, Drive, Led, MoveServo, SetLight, SetMode, Stop
+from gateway.control.commands import Action, AimServo, ChangeSpeed, Drive, Find, Led, MoveServo, SetLight, SetMode, Stop
 from gateway.drivers.yahboom.estimate.outputs import StateEstimate
 from gateway.drivers.yahboom.protocol.frames import General, ModeOpen, encode
 from gateway.drivers.yahboom.protocol.platforms import SPEEDS, parse_platform
 from gateway.sim.model.world import World
-from schemas.words import Light, Mode, Motion, Platform, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Phase, Platform, ServoAction, SpeedStep
 from tests.support.controls import control
 from tests.support.truth import near_walls
 from tests.support.virtual import Pair
@@ -145,3 +145,12 @@ def test_renewed_stop_and_action_wait_for_each_other_without_an_echo(asked_s: fl
     (first_at, first), (then_at, then) = pair.sent[-2:]
     assert {first, then} == {encode(General(Motion.STOP)), encode(General(Motion.STOP, light=Light.RED))}
     assert then_at - first_at > 0.5, "a ranging without an echo takes 1.0 s"
+
+
+def test_blinking_that_has_begun_does_not_wait_for_a_long_stop() -> None:
+    pair = Pair("stm32", told="arduino", start_s=2.0)  # this stop takes 17 s, because nothing shows it
+    pair.connect()
+    pair.ask(Find(), identity="it")
+    pair.run(6.0)
+    assert pair.phases("it")[-1] is Phase.SENT
+    assert pair.control.driver.is_stopping
