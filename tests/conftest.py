@@ -51,6 +51,11 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Visit each folder only once: pytest 9.1 does not find the fixtures of a folder to which it comes back."""
+    config.args.sort()
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Let the scheduler find the session."""
     session.config.stash[scheduling.SESSION] = session
