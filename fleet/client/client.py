@@ -121,9 +121,9 @@ class Fleet:
 
     While a Fleet is open, it has the liveliness token `<fleet>/@operator/<sender>` on the bus. If the token disappears,
     for example because the program has crashed, gateways end the drives of this client, and stop the cars that it
-    drives. Modes that it has switched on go on. So use a Fleet in a `with` block, or call `close`. Otherwise the script
-    ends with a ResourceWarning. A forked process needs a Fleet of its own: one that was opened before the fork raises
-    BusError there.
+    drives. Modes that it has switched on go on, but a mode that has not begun is dropped. So use a Fleet in a `with`
+    block, or call `close`. Otherwise the script ends with a ResourceWarning. A forked process needs a Fleet of its own:
+    one that was opened before the fork raises BusError there.
 
     Raises schemas.bus.NoFleet (a BusError) if there is no fleet, keys.BadKey for a bad name.
     """

@@ -66,14 +66,8 @@ def drive(client: Fleet, cars: tuple[str, ...], motion: str, duration_s: float, 
 
     MOTION is forward, back, left, right, spin_left or spin_right.
     """
-    named = resolve_cars(client, cars)
-    with signals.sigterm_interrupts():
-        try:
-            outcomes = client.ask(replace(drive_request(motion, duration_s), take=take), named)
-        except KeyboardInterrupt:
-            print_outcomes(client.ask(drive_request(Motion.STOP), named), as_json=as_json)
-            raise SystemExit(startup.INTERRUPTED) from None
-    end_with(client, outcomes, as_json=as_json)
+    request = replace(drive_request(motion, duration_s), take=take)
+    _ask_until_ctrl_c(client, request, drive_request(Motion.STOP), resolve_cars(client, cars), as_json=as_json)
 
 
 @click.command(epilog="\b\nexample:\n  fleet mode red tracking\n  fleet mode red,blue manual")
@@ -87,9 +81,24 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 
     MODE is manual, remote_control, tracking, obstacle_avoidance, color_led, light_seeking or following.
 
-    To stop cars, use `fleet stop`: a running plan then leaves them alone.
+    A car is stopped first, so it may be some seconds before the mode begins. Ctrl-C meanwhile keeps the car in mode
+    manual. To stop cars, use `fleet stop`: a running plan then leaves them alone.
     """
-    carry_out(client, mode_request(mode), cars, take=take, as_json=as_json)
+    request = replace(mode_request(mode), take=take)
+    _ask_until_ctrl_c(client, request, mode_request(Mode.MANUAL), resolve_cars(client, cars), as_json=as_json)
+
+
+def _ask_until_ctrl_c(
+    client: Fleet, request: CommandRequest, end: CommandRequest, cars: Sequence[str] | None, *, as_json: bool
+) -> Never:
+    """Send a command to these cars, or to all, and wait for its end. After Ctrl-C or SIGTERM, send them `end`."""
+    with signals.sigterm_interrupts():
+        try:
+            outcomes = client.ask(request, cars)
+        except KeyboardInterrupt:
+            print_outcomes(client.ask(end, cars), as_json=as_json)
+            raise SystemExit(startup.INTERRUPTED) from None
+    end_with(client, outcomes, as_json=as_json)
 
 
 @click.command(epilog="\b\nexamples:\n  fleet stop\n  fleet stop red blue")

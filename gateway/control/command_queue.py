@@ -12,7 +12,7 @@ from msgspec import Struct, field
 
 from gateway.control.command_records import CommandLog, Pending
 from gateway.control.safety_state import Safety
-from gateway.control.sender_presence import Senders
+from gateway.control.sender_presence import SENDER_GONE_S, Senders
 from schemas.limits import MAX_QUEUE_TIME_S
 from schemas.rights import Sender
 from schemas.words import Motion, Phase, Reason
@@ -79,7 +79,7 @@ class CommandQueue(Struct):
         if not self.has_commands:
             return []
         waiting = [*self.one_shots, *([self.mode_change] if self.mode_change is not None else [])]
-        times = [pending.waits_since + MAX_QUEUE_TIME_S for pending in waiting]
+        times = [min(pending.waits_since + MAX_QUEUE_TIME_S, pending.sender_lost_at) for pending in waiting]
         return times if self.held is None else [*times, self.held_until]
 
     def expire(self, now: float) -> None:
@@ -92,7 +92,11 @@ class CommandQueue(Struct):
             written, total = pending.frames_written, pending.frames_written + len(pending.frames)
             begun = f"only {written} of its {total} frames were sent: " if written else ""
             self._end_part(pending, Phase.EXPIRED, Reason.EXPIRED, f"{begun}{words}", now)
-        if self.mode_change is not None and now >= self.mode_change.waits_since + MAX_QUEUE_TIME_S:
+        change = self.mode_change
+        if change is not None and now >= change.sender_lost_at:  # nobody would be there to see the car drive off
+            name = change.command.sender.text_name
+            self.close_mode_change(Phase.EXPIRED, Reason.EXPIRED, f"its sender {name} disconnected", now)
+        elif change is not None and now >= change.waits_since + MAX_QUEUE_TIME_S:
             self.close_mode_change(Phase.EXPIRED, Reason.EXPIRED, words, now)
 
     # ------------------------------------------------------------------ actions on parts of the car
@@ -159,6 +163,12 @@ class CommandQueue(Struct):
         self.one_shots = deque(each for each in self.one_shots if each is not pending)
 
     # ------------------------------------------------------------------ the end of commands
+
+    def on_sender_token(self, name: str, *, alive: bool, now: float) -> None:
+        """Note that the sender of a waiting mode has lost its token, or has it again."""
+        change = self.mode_change
+        if change is not None and change.command.sender.name == name:
+            change.sender_lost_at = float("inf") if alive else now + SENDER_GONE_S
 
     def drop(self, phase: Phase, reason: Reason, words: str, now: float) -> None:
         """End all commands."""

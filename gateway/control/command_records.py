@@ -29,6 +29,8 @@ class Pending(Struct):
     """When the next frame is due, at the end of the delay before it."""
     part: Hashable = None
     """The part of the car that the command acts on, as the driver names it."""
+    sender_lost_at: float = float("inf")
+    """When the sender of a waiting mode counts as lost. Infinite while its token exists, or if it never had one."""
 
     @property
     def waits_since(self) -> float:

@@ -229,6 +229,7 @@ class Controller(Generic[D_co]):
     def on_sender_token(self, name: str, *, alive: bool, now: float) -> None:
         """Update a sender's state: its liveliness token appeared or disappeared."""
         driving = self._queue.held is not None and self._queue.held.sender.name == name
+        self._queue.on_sender_token(name, alive=alive, now=now)
         if alive:
             self._senders.on_token(name)
         else:

@@ -700,3 +700,17 @@ def test_gateway_ends_with_its_parent(fleet: FleetProcesses) -> None:
     starter.popen.kill()
     wait_for(lambda: not driving(sim), "the car stands")
     wait_for(lambda: not fleet.bus.tokens("fleet/red"), f"gateway {gateway} has ended")
+
+
+def test_interrupted_mode_command_opens_no_mode(fleet: FleetProcesses, tcp_car: TcpCar) -> None:
+    """A car that says nothing is stopped for 14 s before a mode. Who has given up does not watch it any more."""
+    events: list[Any] = []
+    fleet.bus.subscribe("fleet/red/event/command", lambda sample: events.append(sample.message()))
+    fleet.gateway(tcp_car.link)
+    wait_for(lambda: tcp_car.received, "the gateway stops the car")
+    command = fleet.start("-m", "fleet.cli", "mode", "red", "tracking", "--connect", fleet.endpoint)
+    wait_for(lambda: [each.phase for each in events] == ["asked", "queued"], "the mode waits for the stop")
+    command.popen.send_signal(signal.SIGINT)
+    assert command.wait() == 130
+    ended = [each for each in events if each.id == events[0].id][-1]
+    assert (ended.phase, ended.words.partition(" by ")[0]) == ("superseded", "mode manual")

@@ -346,6 +346,21 @@ def test_sender_token_away_for_one_second_ends_drive(desk: Workbench) -> None:
     assert desk.records[-1].words == "its sender mia disconnected"
 
 
+@pytest.mark.parametrize("away_s", [0.5, 1.5])
+def test_waiting_mode_of_a_lost_sender_is_dropped(desk: Workbench, away_s: float) -> None:
+    """As of `fleet mode` that is killed before the car has stopped: it would drive off with nobody watching."""
+    desk.control.on_sender_token("mia", alive=True, now=desk.now)
+    desk.ask(FORWARD, PERSON)
+    desk.run(1.0, reports=False)
+    desk.ask(SetMode(Mode.TRACKING), PERSON, identity="it")
+    desk.control.on_sender_token("mia", alive=False, now=desk.now)
+    desk.run(away_s, reports=False)
+    desk.control.on_sender_token("mia", alive=True, now=desk.now)  # the hub was restarted
+    desk.run(20.0)
+    ended = desk.end("it") == (Phase.EXPIRED, Reason.EXPIRED)
+    assert (ended, b"$4WD,MODE21#" in desk.frames) == ((False, True) if away_s < 1.0 else (True, False))
+
+
 def test_sender_token_that_comes_after_its_drive_is_watched(desk: Workbench) -> None:
     desk.ask(Drive(Motion.FORWARD, 10.0), PERSON, identity="it")
     desk.run(0.01)
