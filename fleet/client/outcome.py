@@ -321,13 +321,19 @@ class Progress:
         elif phase == Phase.COMPLETE or (phase == Phase.SENT and self._until is Until.SENT):
             self._end(phase, reason, words, at, ok=reason not in _STILL_STOPPED)
 
+    def _failure(self, phase: str, reason: str) -> tuple[str, ...]:
+        """Return the results that choose the text of a failure, the most specific first."""
+        if phase == Phase.EXPIRED and self._sent_event:  # a drive whose sender is gone was driven until then
+            return (Phase.SUPERSEDED,)
+        return (reason, phase if phase in _FAILED_PHASES else "")
+
     def _end(self, phase: str, reason: str, words: str, at: float, *, ok: bool) -> None:
         if self.outcome is None:
             took_s = at - self._asked_at
             done = UNCONFIRMED if self._basis == Basis.SENT else self._basis or phase
             effect = describe(
                 self._verb,
-                (done, phase) if ok else (reason, phase if phase in _FAILED_PHASES else ""),
+                (done, phase) if ok else self._failure(phase, reason),
                 car=self.car,
                 detail="" if words and self._until is Until.OVER else self._detail,
                 words=words,

@@ -33,6 +33,8 @@ CONNECT_S: Final = 20.0
 AFTER_S: Final = 60.0
 """Time after the last command, in which every outcome must come."""
 STEP_S: Final = 0.02
+GONE_S: Final = 1.1
+"""Maximum time for which a command of somebody who has left may still begin."""
 
 
 @dataclass(slots=True)
@@ -41,6 +43,7 @@ class Said:
 
     identity: str
     request: CommandRequest
+    person: str
     progress: Progress
     asked_at: float
     due: deque[tuple[float, Callable[[], None]]] = field(default_factory=deque)
@@ -66,7 +69,7 @@ class OutcomeReport:
     story: list[str] = field(default_factory=list)
 
 
-class Stage(Protocol):
+class PlayedCar(Protocol):
     """A car and its control on virtual time."""
 
     control: Controller[Driver]
@@ -204,8 +207,8 @@ class Outcomes:
 
     def __init__(self, seed: int) -> None:
         moments = self._moments = random.Random(f"outcome {seed}")
-        self.stage: Stage = SecondFamily(seed, moments) if seed % 5 == 4 else FirstFamily(seed, moments)
-        self.report = OutcomeReport(seed, self.stage.about)
+        self.played: PlayedCar = SecondFamily(seed, moments) if seed % 5 == 4 else FirstFamily(seed, moments)
+        self.report = OutcomeReport(seed, self.played.about)
         self.people = [f"p{number}" for number in range(moments.choice([1, 1, 2, 3]))]
         self._kinds = dict(zip(self.people, ("person", "person", "script"), strict=False))
         self._slow = moments.random() < 0.3
@@ -214,22 +217,25 @@ class Outcomes:
         self._seen = 0
         self._stood_at = 0.0
         """When the motors were off last."""
-        written = self.stage.control.driver.on_written
+        self._left_at: dict[str, float] = {}
+        """When each person has left, who has not come back."""
+        written = self.played.control.driver.on_written
 
         def on_written(write: OutgoingFrame, now: float) -> None:
             for said in self._said:
                 if said.identity == write.command_id:
                     said.frames.append(now)
+                    self._judge_presence(said)
             written(write, now)
 
-        self.stage.control.driver.on_written = on_written  # type: ignore[method-assign]  # the wire has no ids
+        self.played.control.driver.on_written = on_written  # type: ignore[method-assign]  # the wire has no ids
 
     def play(self) -> OutcomeReport:
         """Send commands at random moments, and wait for the outcome of each."""
-        stage, moments = self.stage, self._moments
-        stage.connect()
+        played, moments = self.played, self._moments
+        played.connect()
         for person in self.people:
-            stage.control.on_sender_token(person, alive=True, now=stage.now)
+            played.control.on_sender_token(person, alive=True, now=played.now)
         self.run(moments.choice([0.0, moments.uniform(0.0, 10.0), CONNECT_S]))
         for _ in range(moments.randrange(3, 12)):
             again = bool(self._said) and moments.random() < 0.2
@@ -238,12 +244,12 @@ class Outcomes:
                 moments.choice([0.0, moments.uniform(0.0, 0.5), moments.uniform(0.0, 4.0), moments.uniform(0.0, 20.0)])
             )
             self._disturb()
-        if not stage.linked:
-            stage.connect()
+        if not played.linked:
+            played.connect()
         self.run(AFTER_S)
         for said in self._said:
             if said.progress.outcome is None:
-                self._violate(said, f"no outcome after {stage.now - said.asked_at:.1f} s")
+                self._violate(said, f"no outcome after {played.now - said.asked_at:.1f} s")
         return self.report
 
     # ------------------------------------------------------------------ people
@@ -273,36 +279,38 @@ class Outcomes:
 
     def ask(self, request: CommandRequest) -> None:
         """Send a command of somebody, and put its answer on the bus."""
-        stage, moments = self.stage, self._moments
+        played, moments = self.played, self._moments
         person = moments.choice(self.people)
+        if self._left_at.pop(person, None) is not None:
+            played.control.on_sender_token(person, alive=True, now=played.now)
         identity = f"c{len(self._said) + 1}"
         progress = Progress(
-            "red", request.until, stage.now, request.duration_s, verb=request.effect_verb, detail=request.detail
+            "red", request.until, played.now, request.duration_s, verb=request.effect_verb, detail=request.detail
         )
-        said = Said(identity, request, progress, stage.now)
+        said = Said(identity, request, person, progress, played.now)
         self._said.append(said)
         message = type(request.message)()
         message.CopyFrom(request.message)
         message.id, message.sender, message.kind, message.take = identity, person, self._kinds[person], request.take
         encoding = f"{PROTOBUF};{COMMANDS[request.verb].message}"
-        before = len(stage.records)
+        before = len(played.records)
         try:
             command = command_parser.parse(Request(request.verb, message.SerializeToString(), encoding), 0, car="red")
         except command_parser.BadRequest as error:
             self._violate(said, f"not parsed: {error.words}")
             return
-        answer = stage.control.command(command, stage.now)
-        stage.write()
-        was_sent = any(each.command.id == identity and each.phase is Phase.SENT for each in stage.records[before:])
+        answer = played.control.command(command, played.now)
+        played.write()
+        was_sent = any(each.command.id == identity and each.phase is Phase.SENT for each in played.records[before:])
         status = Phase.SENT if was_sent and answer.status is Phase.QUEUED else answer.status
         self.report.story.append(f"{said} by {person}: {status} {answer.words}")
 
         def arrive() -> None:
             progress.on_answer(
-                str(status), str(answer.reason or ""), answer.words, answer.worst_case_s or 0.0, stage.now
+                str(status), str(answer.reason or ""), answer.words, answer.worst_case_s or 0.0, played.now
             )
 
-        said.answer = stage.now + self._delay_s(), arrive
+        said.answer = played.now + self._delay_s(), arrive
         self._take()
 
     def _delay_s(self) -> float:
@@ -312,44 +320,47 @@ class Outcomes:
 
     def _disturb(self) -> None:
         """Let something else happen, sometimes."""
-        stage, moments = self.stage, self._moments
+        played, moments = self.played, self._moments
         chance = moments.random()
-        if not stage.linked:
+        if not played.linked:
             if chance < 0.5:
-                stage.connect()
+                played.connect()
         elif chance < 0.03:
-            stage.lose()
+            played.lose()
         elif chance < 0.10:
-            stage.disturb(moments)
-        elif chance < 0.12:
-            person = moments.choice(self.people)
-            for alive in (False, True):
-                stage.control.on_sender_token(person, alive=alive, now=stage.now)
+            played.disturb(moments)
+        elif chance < 0.13:
+            self._leave(moments.choice(self.people))
+
+    def _leave(self, person: str) -> None:
+        """Let the program of a person end."""
+        self._left_at[person] = self.played.now
+        self.played.control.on_sender_token(person, alive=False, now=self.played.now)
 
     # ------------------------------------------------------------------ time
 
     def run(self, seconds: float) -> None:
         """Let time pass, pass on what is on the bus, and judge each outcome when it is told."""
-        stage = self.stage
-        end = stage.now + seconds
-        while stage.now < end - 1e-9:
-            stage.run(min(STEP_S, end - stage.now))
-            if not stage.moves:
-                self._stood_at = stage.now
+        played = self.played
+        end = played.now + seconds
+        while played.now < end - 1e-9:
+            played.run(min(STEP_S, end - played.now))
+            if not played.moves:
+                self._stood_at = played.now
             self._take()
             for said in self._said:
                 self._pass_on(said)
 
     def _take(self) -> None:
         """Put new records on the bus, as events."""
-        stage = self.stage
-        for record in stage.records[self._seen :]:
+        played = self.played
+        for record in played.records[self._seen :]:
             for said in self._said:
                 if said.identity == record.command.id:
-                    at = stage.now + self._delay_s()
+                    at = played.now + self._delay_s()
                     at = max(at, said.due[-1][0]) if said.due else at
                     said.due.append((at, self._event_of(said, record)))
-        self._seen = len(stage.records)
+        self._seen = len(played.records)
 
     def _event_of(self, said: Said, record: CommandRecord) -> Callable[[], None]:
         def arrive() -> None:
@@ -358,14 +369,14 @@ class Outcomes:
                 str(record.reason or ""),
                 record.words,
                 record.worst_case_s,
-                self.stage.now,
+                self.played.now,
                 str(record.basis),
             )
 
         return arrive
 
     def _pass_on(self, said: Said) -> None:
-        now = self.stage.now
+        now = self.played.now
         if said.answer is not None and said.answer[0] <= now:
             said.answer[1]()
             said.answer = None
@@ -380,13 +391,21 @@ class Outcomes:
 
     # ------------------------------------------------------------------ the judge
 
+    def _judge_presence(self, said: Said) -> None:
+        """Find a car that begins to move for somebody who has left."""
+        away_s = self.played.now - self._left_at.get(said.person, self.played.now)
+        is_first = len(said.frames) == 1
+        if is_first and away_s > GONE_S and said.request.verb in (Verb.DRIVE, Verb.MODE) and "manual" not in str(said):
+            self._violate(said, f"begins {away_s:.1f} s after {said.person} has left")
+
     def _judge(self, said: Said, outcome: Outcome) -> None:
         verb = said.request.verb
         self.report.outcomes[f"{verb} {outcome.code or outcome.phase} {outcome.basis}"] += 1
-        self.report.story.append(f"{self.stage.now:.2f} {said.identity}: {outcome}")
+        self.report.story.append(f"{self.played.now:.2f} {said.identity}: {outcome}")
         if outcome.code in (NO_ANSWER, NO_RESULT):
             self._violate(said, f"nothing was lost on the bus, but: {outcome}")
-        if outcome.phase in (Phase.REJECTED, Phase.EXPIRED) and said.frames and "frames were sent" not in outcome.words:
+        is_denied = outcome.effect.startswith(("refused", "not done")) and "frames were sent" not in outcome.effect
+        if is_denied and said.frames:
             self._violate(said, f"frames at {said.frames}, but: {outcome}")
         if outcome.ok and outcome.effect.endswith(" sent") and verb not in STOP_VERBS and not said.frames:
             self._violate(said, f"no frame, but: {outcome}")
@@ -397,7 +416,7 @@ class Outcomes:
             self._violate(said, f"the motors ran all the time, but: {outcome}")
 
     def _violate(self, said: Said, words: str) -> None:
-        self.report.violations.append(f"{self.stage.now:.2f} {said}: {words}")
+        self.report.violations.append(f"{self.played.now:.2f} {said}: {words}")
 
 
 def play(seed: int) -> OutcomeReport:

@@ -23,7 +23,7 @@ def violations_of_an_extended_drive() -> list[str]:
     """Extend a drive by more than a client waits beyond its end."""
     episode = Outcomes(0)
     episode.people = ["p0"]
-    episode.stage.connect()
+    episode.played.connect()
     episode.run(CONNECT_S)
     episode.ask(drive_request(Motion.FORWARD, 1.0))
     episode.run(0.5)

@@ -277,6 +277,14 @@ def test_command_without_result_has_own_code() -> None:
     assert str(progress.outcome).endswith(" [no_answer]")
 
 
+def test_drive_of_lost_sender_is_not_called_not_done() -> None:
+    progress = Progress("red", Until.OVER, 100.0, 9.0, verb="drive", detail="9.0 s")
+    for phase in ("queued", "sent"):
+        progress.on_event(phase, "", "", 0.0, 100.1)
+    progress.on_event("expired", "expired", "its sender mia disconnected", 0.0, 103.0)
+    assert str(progress.outcome) == "red: ended early: its sender mia disconnected [expired]"
+
+
 def test_extended_drive_needs_no_event_of_its_end() -> None:
     progress = told(Until.OVER, [("answer", "sent", 0.0), ("event", "sent", 0.0)], 2.0)
     assert progress.deadline == 100.0 + 2.0 + 5.0
