@@ -62,13 +62,13 @@ def note_failures(
     """Return the modes that cars have failed to change to, with those that they fail to change to now.
 
     A failure is remembered also while the car has no role. Otherwise two broken cars would take turns in a role, while
-    a third one that works has none. It is forgotten after a while, and when the car is left `alone`: somebody may have
-    mended it, or its gateway is new.
+    a third one that works has none. It is forgotten after a while, when the car is in the mode, and when it is left
+    `alone`: somebody may have mended it, or its gateway is new.
     """
     found = {
         (car, mode): at
         for (car, mode), at in failed_modes.items()
-        if now - at < FAILED_MODE_KEPT_S and car not in alone
+        if now - at < FAILED_MODE_KEPT_S and car not in alone and not _is_surely_in(snapshot, car, mode)
     }
     for car, each in attempts.items():
         known = snapshot.cars.get(car, UNKNOWN_CAR)
@@ -76,6 +76,11 @@ def note_failures(
         if is_contradicted and each.failed(now, busy=known.busy) >= ATTEMPTS_BEFORE_REPLACEMENT:
             found[car, each.mode] = now
     return found
+
+
+def _is_surely_in(snapshot: FleetSnapshot, car: str, mode: str) -> bool:
+    known = snapshot.cars.get(car, UNKNOWN_CAR)
+    return known.mode == mode and known.verdict == Verdict.CONFIRMED
 
 
 class HeldRole(Struct, frozen=True):

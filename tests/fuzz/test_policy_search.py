@@ -21,6 +21,11 @@ def test_search_finds_that_a_car_is_replaced_while_it_changes_back(monkeypatch: 
     assert any("loses" in fault for seed in range(EPISODES) for fault in play(seed).faults)
 
 
+def test_role_is_kept_while_a_rule_has_a_car_that_had_failed_before() -> None:
+    """In this fleet, the car had opened its mode at the third try, 19 s before the rule needed it."""
+    assert play(56306).faults == []
+
+
 @pytest.mark.parametrize("seed", [62, 123])
 def test_search_finds_that_broken_cars_take_turns(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In these fleets, two cars ignore a mode, and nothing happens to them at the end."""
