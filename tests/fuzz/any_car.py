@@ -13,7 +13,7 @@ from gateway.drivers.yahboom.executor import FREE_ACTIONS
 from gateway.drivers.yahboom.protocol.frames import ModeOpen
 from gateway.drivers.yahboom.protocol.platforms import parse_platform
 from gateway.drivers.yahboom.protocol.timing import REPEAT_INTERVAL_S
-from gateway.sim.model.traits import CarTraits
+from gateway.sim.model.traits import SIM_FIRST_READING_S, CarTraits
 from schemas.words import Light, Mode, Motion, Phase, Verdict
 from tests.support.stops import WORLDS
 from tests.support.virtual import Pair
@@ -50,12 +50,17 @@ def draw_car(moments: random.Random, *, modes: bool) -> DrawnCar:
         close_s=moments.choice(CLOSES_S),
         last_frame_wins=moments.random() < 0.2,
         silent_modes=frozenset(mode for mode in _PRINTING if moments.random() < 0.15),
+        first_reading_s=_first_reading_s(random.Random(hash(moments.getstate()))),  # so that older draws stay
         text=moments.random() < 0.2,
         readings=readings,
     )
     if not readings:
         told = f"{told}+no_readings"
     return DrawnCar(platform, told, traits)
+
+
+def _first_reading_s(moments: random.Random) -> float:
+    return SIM_FIRST_READING_S if moments.random() < 0.6 else moments.uniform(0.0, 5.0)
 
 
 # ---------------------------------------------------------------------- use of a car on a whole link

@@ -50,6 +50,8 @@ UNREACTED: Final = 4
 """Number of undisturbed blocking frames without a reaction after which a car counts as one that cannot show a stop."""
 REACTED: Final = 3
 """Number of consecutive reactions that withdraw the finding that a car cannot show a stop."""
+FIRST_READINGS: Final = 2
+"""Number of first readings of a mode that are remembered. The earlier one counts, because the link may lose some."""
 MAX_LEARNED_S: Final = 10.0
 """Maximum interval or block: three times those of the slowest car. A longer gap comes from the link or our loop. If it
 became the rhythm, as the first interval does, each stop would wait that long for a report before it is sent again."""
@@ -161,6 +163,8 @@ class Learned(Struct):
     """The speeds that the car may have had when the last gateway ended."""
     reporting: set[Mode] = field(default_factory=set)
     """The modes in which the car has sent readings."""
+    first_readings: dict[Mode, deque[float]] = field(default_factory=dict)
+    """How long after the opening of a mode its first reading came, the last times. The motors run meanwhile."""
     extremes: dict[str, tuple[float, float]] = field(default_factory=dict)
     """The lowest and the highest accepted value of each field, as on the wire. 0 and 1 for a field of bits."""
     rejected: dict[str, int] = field(default_factory=dict)
@@ -191,8 +195,18 @@ class Learned(Struct):
         self.shows, self.doubted, self._unreacted = Shows.UNKNOWN, False, 0
         self._delays.clear()
         self._blocks.clear()
+        self.first_readings.clear()
         self.extremes.clear()
         self.rejected.clear()
+
+    def add_first_reading(self, mode: Mode, after_s: float) -> None:
+        """Record how long after the opening of a mode its first reading came."""
+        if 0.0 < after_s <= MAX_LEARNED_S:
+            self.first_readings.setdefault(mode, deque(maxlen=FIRST_READINGS)).append(after_s)
+
+    def first_reading_s(self, mode: Mode, expected_s: float) -> float:
+        """Return the longest time from the opening of a mode to its first reading: as expected, or as observed."""
+        return max(expected_s, min(self.first_readings.get(mode, (expected_s,))))
 
     def interval_s(self, expected_s: float) -> float:
         """Return the interval of the reports with an echo: the observed one, or else the expected one."""
@@ -291,6 +305,9 @@ class Learned(Struct):
             "reporting": sorted(self.reporting),
             "opened_as": self.opened_as,
             "blocks_s": {str(kind): round(block_s, 4) for kind, block_s in self._blocks.items()},
+            "first_readings_s": {
+                str(mode): [round(each, 4) for each in times] for mode, times in self.first_readings.items()
+            },
         }
 
     @classmethod
@@ -311,6 +328,9 @@ class Learned(Struct):
         learned._blocks = {Blocking(kind): float(block_s) for kind, block_s in kept["blocks_s"].items()}
         if not all(0.0 < each <= MAX_LEARNED_S for each in learned._blocks.values()):
             raise ValueError(f"blocks_s: {learned._blocks}")
+        for mode, times in kept.get("first_readings_s", {}).items():
+            for each in times:
+                learned.add_first_reading(Mode(mode), float(each))
         return learned
 
 

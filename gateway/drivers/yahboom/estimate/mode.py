@@ -58,6 +58,8 @@ class ModeEstimator(Struct):
     """The time by which a car that obeys has entered the commanded mode."""
     _in_same_mode_by: float = field(default=float("-inf"))
     """The time by which a car has entered the commanded mode if it was in this mode already at the last frame."""
+    _opened_at: float | None = None
+    """When the commanded mode was open at the earliest, until its first reading has come."""
     _heard_at: float = field(default=float("-inf"))
     _own_at: float = field(default=float("-inf"))
     _other_at: float = field(default=float("-inf"))
@@ -90,6 +92,7 @@ class ModeEstimator(Struct):
         turn_s = self.profile.mode_turn_s(previous or Mode.OBSTACLE_AVOIDANCE)
         self._in_mode_by = max(self._in_mode_by, now + turn_s) + block_s
         self._in_same_mode_by = now + self.profile.mode_turn_s(mode) + block_s
+        self._opened_at = None if mode is Mode.MANUAL else now + block_s
         if mode is self.asked is Mode.MANUAL and self.verdict is Verdict.CONFIRMED:
             return
         if mode is not self.asked or self.verdict is not Verdict.ASSUMED:
@@ -135,6 +138,9 @@ class ModeEstimator(Struct):
             if len(candidates) > 1:
                 return
             self._matches += 1
+            if self._opened_at is not None and at > self._opened_at:
+                self.learned.add_first_reading(self.asked, at - self._opened_at)
+                self._opened_at = None
             self._in_mode_by = min(self._in_mode_by, self._in_same_mode_by)
             if at >= self._asked_at and (
                 self._matches >= CONTRADICTING_FRAMES or at > self._other_at + CORRUPTED_MATCH_S
@@ -268,7 +274,9 @@ class ModeEstimator(Struct):
 
     def _silence_s(self, heard_at: float, now: float) -> float:
         # The motors of a mode run for a while before its first reading, so that silence shows nothing.
-        first_s = 0.0 if self.asked is None else MODES[self.asked].first_reading_s
+        asked, first_s = self.asked, 0.0
+        if asked is not None and self._opened_at is not None:
+            first_s = self.learned.first_reading_s(asked, MODES[asked].first_reading_s)
         since = max(heard_at, self._in_mode_by + first_s, self._excused_at)
         # Do not count blocks that are much older than the last reading: the car had obeyed those frames before it began
         # that reading, which takes up to 1.0 s of ranging.

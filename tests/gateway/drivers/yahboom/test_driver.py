@@ -1,13 +1,29 @@
 """The refusals of a driver of this family, and its claims about the parts of a car."""
 
+import json
+
 import pytest
 
-from gateway.control.commands import Action, AimServo, ChangeSpeed, Drive, Find, Led, MoveServo, SetLight, SetMode, Stop
+from gateway.control.commands import (
+    Action,
+    AimServo,
+    ChangeSpeed,
+    Drive,
+    Find,
+    Led,
+    MoveServo,
+    Resume,
+    SetLight,
+    SetMode,
+    Stop,
+)
+from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.estimate.outputs import StateEstimate
 from gateway.drivers.yahboom.protocol.frames import General, ModeOpen, encode
 from gateway.drivers.yahboom.protocol.platforms import SPEEDS, parse_platform
+from gateway.sim.model.traits import CarTraits
 from gateway.sim.model.world import World
-from schemas.words import Light, Mode, Motion, Phase, Platform, ServoAction, SpeedStep
+from schemas.words import Light, Mode, Motion, Phase, Platform, ServoAction, SpeedStep, Verdict
 from tests.support.controls import control
 from tests.support.truth import near_walls
 from tests.support.virtual import Pair
@@ -154,3 +170,20 @@ def test_blinking_that_has_begun_does_not_wait_for_a_long_stop() -> None:
     pair.run(6.0)
     assert pair.phases("it")[-1] is Phase.SENT
     assert pair.control.driver.is_stopping
+
+
+def test_mode_with_a_late_first_reading_is_not_contradicted_the_second_time() -> None:
+    pair = Pair(start_s=2.0, traits=CarTraits(first_reading_s=4.0)).ready()
+    for _ in range(2):
+        pair.ask(SetMode(Mode.TRACKING), identity="it")
+        opened = pair.now
+        while pair.now < opened + 12.0:
+            pair.run(0.1)
+            assert pair.control.driver.model.mode.verdict is not Verdict.CONTRADICTED, pair.now - opened
+        assert pair.control.driver.model.mode.verdict is Verdict.CONFIRMED
+        pair.ask(Stop(), verb="stop")
+        pair.run(10.0)
+        pair.ask(Resume())
+    kept = Learned.restore(json.loads(json.dumps(pair.control.driver.kept())))
+    assert kept.first_reading_s(Mode.TRACKING, 1.7) == pytest.approx(4.0, abs=0.3)
+    pair.run(5.0)
