@@ -394,8 +394,13 @@ class Outcomes:
     def _judge_presence(self, said: Said) -> None:
         """Find a car that begins to move for somebody who has left."""
         away_s = self.played.now - self._left_at.get(said.person, self.played.now)
-        is_first = len(said.frames) == 1
-        if is_first and away_s > GONE_S and said.request.verb in (Verb.DRIVE, Verb.MODE) and "manual" not in str(said):
+        request = said.request
+        moves = (
+            request.verb in (Verb.DRIVE, Verb.MODE)
+            and request.until is not Until.STOPPED
+            and request.detail != Mode.MANUAL
+        )
+        if moves and len(said.frames) == 1 and away_s > GONE_S:
             self._violate(said, f"begins {away_s:.1f} s after {said.person} has left")
 
     def _judge(self, said: Said, outcome: Outcome) -> None:
