@@ -298,7 +298,7 @@ class Wild:
             self._check_mover(write)
             # What the car has not shown forbids nothing. But the first frames of a stop always go out before.
             running = self.control.driver.stops.running
-            assert running is None or running.sent_all
+            assert running is None or running.sent_once
 
     def _check_mover(self, write: OutgoingFrame) -> None:
         """Require that only a lead starts a paused car, and only the borrower or a lead starts a lent car."""

@@ -20,10 +20,10 @@ Patch = Callable[[object, str, Any], None]
 
 def _time_decides(patch: Patch) -> None:
     def await_time(self: StopExecutor, running: StopInProgress, now: float) -> None:
-        if now >= running.obeys_by:
+        if running.try_sent and now >= running.obeys_by:
             self._finish(running, Basis.SHOWN, "time", now)
 
-    patch(StopExecutor, "_check_evidence", await_time)
+    patch(StopExecutor, "check_evidence", await_time)
 
 
 def _no_second_try(patch: Patch) -> None:
@@ -87,13 +87,13 @@ def _shutdown_waits_for_time(patch: Patch) -> None:
     patch(
         StopExecutor,
         "finished",
-        property(lambda self: self.shutting_down and (self.running is None or self.running.frames_sent)),
+        property(lambda self: self.shutting_down and (self.running is None or self.running.try_sent)),
     )
 
 
 def _sent_without_a_report(patch: Patch) -> None:
     def ends(self: StopExecutor, running: StopInProgress, now: float) -> StopCase | None:
-        return cases.NO_ECHO if running.frames_sent and now >= running.obeys_by else None
+        return cases.NO_ECHO if running.try_sent and now >= running.obeys_by else None
 
     patch(StopExecutor, "_case_that_ends", ends)
 

@@ -137,7 +137,9 @@ class Executor(Driver):
         return self._next_command(now)
 
     def _next_step(self, running: StopInProgress, now: float) -> OutgoingFrame | None:
-        if not self.stops.is_step_due(running, now):
+        """Return the next frame of a stop if it is due. This may end the stop instead, or begin its next try."""
+        self.stops.check_evidence(running, now)
+        if self.stops.running is not running or running.try_sent or now < running.due_at(self.model.pacing):
             return None
         # The color frame that clears a string uses the last color, even if somebody has set it during this stop.
         frame = self.model.believed.led if isinstance(running.frame, ColorLed) else running.frame
@@ -287,7 +289,7 @@ class Executor(Driver):
         running = self.stops.running
         if running is None or running.sequence.rank <= SOFT.rank:
             return False
-        return running.sent_all or not running.repeats
+        return running.sent_once or not running.repeats
 
     def _has_new_command(self, now: float) -> bool:
         """Return True if a command waits that may go before the repeats of the running stop."""
@@ -313,7 +315,7 @@ class Executor(Driver):
         running = self.stops.running
         if running is None or not running.is_soft or running.index == 0:
             return False
-        if not (running.may_be_lost and not running.frames_sent) and now >= self._soft_stop_read_at:
+        if not (running.may_be_lost and not running.try_sent) and now >= self._soft_stop_read_at:
             return False
         pending = self.queue.next_part(now)
         return pending is not None and not isinstance(pending.next_frame, General)

@@ -66,7 +66,7 @@ class StopExecutor:
             running.why = why
         # A new command need not wait for the next try, but for this silence: only after it does the car read the next
         # frame by itself, and not as a part of the last one.
-        if pending is not None and running.frames_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
+        if pending is not None and running.try_sent and now >= running.closed_at + RECOVERY_SILENCE_S:
             running.begin_try(self.full(now), now)
         if running.first_at is not None and pending is not None:
             self._log.record_sent(pending, now, f"joined the running {running.sequence.name} stop")
@@ -176,24 +176,19 @@ class StopExecutor:
         if self.model.evidence.settle(now):
             self._finish(running, Basis.SHOWN, self.model.evidence.words, now)
 
-    def is_step_due(self, running: StopInProgress, now: float) -> bool:
-        """Return True if the next frame of the stop is due. After the last frame, check for evidence instead."""
-        if running.frames_sent:
-            self._check_evidence(running, now)
-            if self.running is not running or running.frames_sent:
-                return False
-        return now >= running.due_at(self.model.pacing)
+    def check_evidence(self, running: StopInProgress, now: float) -> None:
+        """Decide what follows the last frame of a try: the end of the stop, or its next try. Earlier, do nothing.
 
-    def _check_evidence(self, running: StopInProgress, now: float) -> None:
-        """End the stop as sent if the car cannot show it. Send it again if the car can, but did not in time."""
+        The stop ends as sent if the car cannot show it. If the car can, but did not in time, the stop is sent again.
+        """
+        if not running.try_sent:
+            return
         case = self._case_that_ends(running, now)
         if case is cases.SOFT and self.model.is_deaf:
             self._doubt_soft(running, now)
-            return
-        if case is not None:
+        elif case is not None:
             self._finish(running, Basis.SENT, case.why(self.model.name), now, case)
-            return
-        if self.model.evidence.settles_at is None and now >= running.try_due_at(self.model.pacing):
+        elif self.model.evidence.settles_at is None and now >= running.try_due_at(self.model.pacing):
             self._try_again(running, now)
 
     def _case_that_ends(self, running: StopInProgress, now: float) -> StopCase | None:
@@ -201,15 +196,15 @@ class StopExecutor:
         if self.model.trust.state is CarTrust.UNHEARD:
             return None
         facts = self._facts(running, now)
-        if not facts.frames_sent or not (facts.is_time_up or facts.reported):
+        if not facts.try_sent or not (facts.is_time_up or facts.reported):
             return None
         return running.case.ends(facts)
 
     def _facts(self, running: StopInProgress, now: float) -> StopFacts:
         model = self.model
         return StopFacts(
-            frames_sent=running.frames_sent,
-            sent_all=running.sent_all,
+            try_sent=running.try_sent,
+            sent_once=running.sent_once,
             is_time_up=now >= running.obeys_by,
             reported=running.report_at > running.last_at,
             reported_in_try=running.report_at > running.try_at,
@@ -308,7 +303,7 @@ class StopExecutor:
         if finding is not Finding.NOTHING and at > running.closed_at + FLIGHT_S and at > running.first_at + FLIGHT_S:
             running.report_at = at
             if at >= running.closed_at + evidence.close_s - EARLY_S > float("-inf"):
-                running.sent_all = True  # the report shows that the car is in mode 0, and reads frames
+                running.sent_once = True  # the report shows that the car is in mode 0, and reads frames
         match finding:
             case Finding.SHOWN:
                 self._finish(running, Basis.SHOWN, evidence.words, now)
@@ -326,8 +321,8 @@ class StopExecutor:
             if self.model.learned.echo.is_known:  # a rhythm was learned, but now it is another one
                 next_s = at - running.last_at + stop_in_progress.SLOWEST_S + stop_in_progress.REPORT_MARGIN_S
                 running.report_wait_s = max(running.report_wait_s, next_s)
-        if self.running is running and running.frames_sent:
-            self._check_evidence(running, now)
+        if self.running is running:
+            self.check_evidence(running, now)
         # A probe proves something only if the car is awake, as it is directly after a report. If the probe cannot be
         # sent now, wait for the next report.
         is_ready = now >= self.model.pacing.ready_at(Gate.ALONE)
@@ -357,7 +352,7 @@ class StopExecutor:
         """Stop the car after a sleep of the computer. If a stop runs that is not soft, send its next try at once."""
         running = self.running
         if running is not None and running.sequence.rank > sequences.SOFT.rank:
-            if running.frames_sent:
+            if running.try_sent:
                 self._try_again(running, now)
         elif running is not None or not self.shutting_down:
             self.begin(self.full(now), FrameOrigin.STOP, now)
@@ -372,7 +367,7 @@ class StopExecutor:
         if (
             running.case.repeats_lost
             and running.tries == 1
-            and (running.frames_sent or running.sequence is sequences.PROBE)
+            and (running.try_sent or running.sequence is sequences.PROBE)
         ):
             self._try_again(running, now)
             if running.sequence.is_recovery:
@@ -409,11 +404,11 @@ class StopExecutor:
         times = self.timeouts(running)
         if self.model.evidence.settles_at is not None:
             times.append(self.model.evidence.settles_at)
-        elif running.frames_sent:
+        elif running.try_sent:
             times.append(running.try_due_at(self.model.pacing))
-        if running.frames_sent and running.obeys_by > now:
+        if running.try_sent and running.obeys_by > now:
             times.append(running.obeys_by)
-        if not running.frames_sent:
+        if not running.try_sent:
             times.append(running.due_at(self.model.pacing))
         return times
 

@@ -153,7 +153,7 @@ def test_stop_awaiting_evidence_is_resent_after_sleep(desk: Workbench) -> None:
     desk.ask(FORWARD)
     desk.run(1.0)
     desk.ask(Stop(), identity="stop")
-    desk.until(lambda: bool(desk.control.driver.stops.running and desk.control.driver.stops.running.frames_sent))
+    desk.until(lambda: bool(desk.control.driver.stops.running and desk.control.driver.stops.running.try_sent))
     sleep(desk)
     desk.run(0.1)
     assert MODE00 in desk.frames

@@ -23,10 +23,10 @@ Raspberry Pi, which never reacts."""
 class StopFacts(Struct, frozen=True):
     """The facts about the stop in progress on which the rules of the cases depend."""
 
-    frames_sent: bool
-    """All frames of this try are written."""
-    sent_all: bool
-    """All frames of a try are written, or a report has arrived after the block of its `MODE00`."""
+    try_sent: bool
+    """All frames of the current try are written."""
+    sent_once: bool
+    """A whole try was written, or a report has made that unnecessary (see `StopInProgress`)."""
     is_time_up: bool
     """By now the car has obeyed, if the frames arrived."""
     reported: bool
@@ -116,12 +116,12 @@ def _by_echo(facts: StopFacts) -> StopCase | None:
 
 
 def _probes_wrong(facts: StopFacts) -> bool:
-    return facts.frames_sent and facts.probes < DOUBTED_PROBES
+    return facts.try_sent and facts.probes < DOUBTED_PROBES
 
 
 def _probes_in_mode_0(facts: StopFacts) -> bool:
     # The first frames of a stop are always written before a probe, unless a report shows that the car is in mode 0.
-    return facts.can_show and facts.sent_all
+    return facts.can_show and facts.sent_once
 
 
 LEFT_SHAPE: Final = StopCase(

@@ -98,8 +98,9 @@ class StopInProgress(Struct):
     without_echo: int = 0
     """Number of reports without an echo in this stop, except those that came in the block of a `MODE00`."""
     probes: int = 0
-    sent_all: bool = False
-    """True if all frames of a try are written, or a report has arrived after the block of its `MODE00`."""
+    sent_once: bool = False
+    """True once a whole try was written, whichever try is under way now. A report that arrives after the block of a
+    `MODE00` counts as much: the car is in mode 0, and reads frames."""
     overdue: bool = False
     """True if the car did not show the stop in time. The gateway continues to send it."""
     mode_command: Pending | None = None
@@ -110,8 +111,8 @@ class StopInProgress(Struct):
     """The case of the stop: it decides when the stop may end if the car does not show it."""
 
     @property
-    def frames_sent(self) -> bool:
-        """Return True if the last frame of this try is written."""
+    def try_sent(self) -> bool:
+        """Return True if all frames of the current try are written."""
         return self.index >= len(self.sequence.steps)
 
     @property
@@ -153,7 +154,7 @@ class StopInProgress(Struct):
     @property
     def goes_first_at(self) -> float:
         """Return when the next frame of the stop goes before a stream of actions."""
-        if self.frames_sent:
+        if self.try_sent:
             return self.next_try_at
         if self.tries > 1 and self.index > 0:
             return float("-inf")  # in a recovery, the car must read nothing else before the lone `MODE00`
@@ -175,21 +176,21 @@ class StopInProgress(Struct):
         """
         if self.repeats:
             return self.began_at
-        if not self.sent_all:
+        if not self.sent_once:
             return float("inf")
         return self.report_at if self.report_at > float("-inf") else self.obeys_by
 
     def worst_s(self, now: float) -> float:
         """Return the longest time until the motors are off, s, if the frames arrive."""
-        worst_at = self.worst_at + (0.0 if self.frames_sent else max(0.0, now - self.due))
-        if self.sequence.is_recovery and self.frames_sent:
+        worst_at = self.worst_at + (0.0 if self.try_sent else max(0.0, now - self.due))
+        if self.sequence.is_recovery and self.try_sent:
             # The car may have read all frames as one string, and so misread them. Then only the next try stops it.
             worst_at = max(worst_at, self.next_try_at + AVOIDING_TURN_S)
         return max(worst_at - now, 0.0) + WIRE_S
 
     def over_at(self, pacing: Pacing, now: float) -> float:
         """Return when a new command may replace the stop, as far as that is known."""
-        if self.sent_all or self.repeats:
+        if self.sent_once or self.repeats:
             return max(self.gives_way_at, now)
         began = self.first_at if self.first_at is not None else max(now, self.due_at(pacing))
         return max(began + self.sequence.length_s + FLIGHT_S, self.worst_at, now)
@@ -204,7 +205,7 @@ class StopInProgress(Struct):
         if isinstance(self.frame, ModeClose):
             self.closed_at = now
         self.index += 1
-        self.sent_all = self.sent_all or self.frames_sent
+        self.sent_once = self.sent_once or self.try_sent
         return first
 
     def on_other_written(self, now: float) -> None:
