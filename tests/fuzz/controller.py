@@ -181,7 +181,7 @@ class Wild:
             self.control.driver.shut_down(self.now)
             self.ending = True
         self._pump()
-        if self.ending and (self.control.driver.stops.finished or moments.random() < 0.01):
+        if self.ending and (self.control.driver.finished or moments.random() < 0.01):
             self._restart()
 
     def _command(self, what: Action) -> Command:

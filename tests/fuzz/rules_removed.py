@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from gateway.drivers.yahboom.driver import YahboomDriver
 from gateway.drivers.yahboom.estimate.mode import ModeEstimator
 from gateway.drivers.yahboom.protocol import frame_splitter
 from gateway.drivers.yahboom.protocol.platforms import Profile
@@ -84,11 +85,11 @@ def _confirmations_stay(patch: Patch) -> None:
 
 
 def _shutdown_waits_for_time(patch: Patch) -> None:
-    patch(
-        StopExecutor,
-        "finished",
-        property(lambda self: self.shutting_down and (self.running is None or self.running.try_sent)),
-    )
+    def finished(self: YahboomDriver) -> bool:
+        running = self.stops.running
+        return self.shutting_down and (running is None or running.try_sent)
+
+    patch(YahboomDriver, "finished", property(finished))
 
 
 def _sent_without_a_report(patch: Patch) -> None:

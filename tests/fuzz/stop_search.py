@@ -634,7 +634,7 @@ class Episode:
         """Shut the gateway down. If its car is not stopped, start another gateway, as `fleet up` does."""
         for _ in range(6):
             self.control.driver.shut_down(self.now)
-            self._until(lambda: self.control.driver.stops.finished, 18.0)
+            self._until(lambda: self.control.driver.finished, 18.0)
             ended, self._claim_since = self.control, None
             self._note(f"ended: not stopped {ended.driver.stops.not_stopped!r}, {ended.driver.model.basis}")
             if not ended.driver.stops.not_stopped:

@@ -146,11 +146,6 @@ class StopExecutor:
         elif not (self.model.at_rest and self.model.trust.shown) or self.running is not None:
             self.begin(self.full(now), FrameOrigin.SHUTDOWN, now)
 
-    @property
-    def finished(self) -> bool:
-        """Return True after `shut_down` if the stop is over, or was given up because of its time or of a lost link."""
-        return self.shutting_down and self.running is None
-
     def is_shutdown_timed_out(self, now: float) -> bool:
         """Return True if a gateway that shuts down has waited long enough for evidence of the stop."""
         return self.shutting_down and now >= self._shutdown_until

@@ -744,7 +744,7 @@ def test_shutdown_ends_when_stop_is_shown_or_sent(platform: str, state: Callable
     began, sent = desk.now, len(desk.sent)
     desk.control.driver.shut_down(desk.now)
     desk.control.driver.shut_down(desk.now)
-    while not desk.control.driver.stops.finished:
+    while not desk.control.driver.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01)
     assert not desk.control.driver.stops.not_stopped
@@ -771,7 +771,7 @@ def test_shutdown_without_reports_ends_in_time_and_says_not_stopped(
         desk.run(0.1)
     began = desk.now
     desk.control.driver.shut_down(desk.now)
-    while not desk.control.driver.stops.finished:
+    while not desk.control.driver.finished:
         assert desk.now - began <= SHUTDOWN_S
         desk.run(0.01, reports=False)
     desk.take()
@@ -786,7 +786,7 @@ def test_shutdown_without_reports_ends_in_time_and_says_not_stopped(
 def test_shutdown_without_link_says_not_stopped_at_once(desk: Workbench) -> None:
     desk.control.driver.link_down("unplugged", desk.now)
     desk.control.driver.shut_down(desk.now)
-    assert desk.control.driver.stops.finished
+    assert desk.control.driver.finished
     desk.take()
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
     assert "red is unreachable (unplugged)" in desk.logs[0].words
@@ -805,7 +805,7 @@ def test_shutdown_before_first_link_says_car_not_reached() -> None:
     """The previous gateway may have left the car driving."""
     desk = Workbench()
     desk.control.driver.shut_down(desk.now)
-    assert desk.control.driver.stops.finished
+    assert desk.control.driver.finished
     desk.take()
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
     assert desk.control.driver.stops.not_stopped
@@ -819,7 +819,7 @@ def test_shutdown_while_tracking_is_told() -> None:
     pair.lose_frames()
     began = pair.now
     pair.control.driver.shut_down(began)
-    pair.until(lambda: pair.control.driver.stops.finished, SHUTDOWN_S + 0.1)
+    pair.until(lambda: pair.control.driver.finished, SHUTDOWN_S + 0.1)
     assert pair.car.truth.mode is Mode.TRACKING
     assert pair.control.driver.stops.not_stopped
     assert pair.logs[-1].code == "not_stopped"
@@ -830,7 +830,7 @@ def test_shutdown_while_tracking_waits_until_stop_is_shown() -> None:
     pair.ask(SetMode(Mode.TRACKING))
     pair.run(8.0)
     pair.control.driver.shut_down(pair.now)
-    assert pair.until(lambda: pair.control.driver.stops.finished, SHUTDOWN_S) <= 1.1 + 4.5
+    assert pair.until(lambda: pair.control.driver.finished, SHUTDOWN_S) <= 1.1 + 4.5
     assert pair.control.driver.model.mode.verdict is Verdict.CONFIRMED
     assert pair.control.driver.model.basis == Basis.SHOWN
     assert not pair.control.driver.stops.not_stopped
@@ -843,7 +843,7 @@ def test_link_loss_during_shutdown_logs_not_stopped(desk: Workbench) -> None:
     assert desk.frames == [RUN, MODE00]
     desk.control.driver.link_down("unplugged", desk.now)
     desk.take()
-    assert desk.control.driver.stops.finished
+    assert desk.control.driver.finished
     assert [entry.code for entry in desk.logs] == ["not_stopped"]
 
 

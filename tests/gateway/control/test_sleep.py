@@ -166,7 +166,7 @@ def test_sleep_at_shutdown_begins_no_stop_after_it() -> None:
     desk.control.driver.shut_down(desk.now)
     sleep(desk)
     desk.run(10.0)
-    assert desk.control.driver.stops.finished
+    assert desk.control.driver.finished
     desk.sent.clear()
     sleep(desk)
-    assert desk.control.driver.stops.finished
+    assert desk.control.driver.finished

@@ -155,7 +155,7 @@ def test_silent_raspberry_pi_is_taken_as_such_until_reading() -> None:
     assert "platform_contradicted" in {record.code for record in pair.logs}
     assert not any(b"MODE" in data for _, data in pair.sent)
     control.driver.shut_down(pair.now)
-    pair.until(lambda: control.driver.stops.finished, 2.0)
+    pair.until(lambda: control.driver.finished, 2.0)
     assert not control.driver.stops.not_stopped
 
 

@@ -386,7 +386,7 @@ def pi_hang_up(pair: Pair) -> None:
     """Require that the gateway closes only after a stop. It cannot prevent a lost link, so it reports the danger."""
     driving(pair)
     pair.control.driver.shut_down(pair.now)
-    pair.until(lambda: pair.control.driver.stops.finished, 3.0)
+    pair.until(lambda: pair.control.driver.finished, 3.0)
     pair.lose("closed")
     pair.run(SETTLED_S, linked=False)
     assert not pair.car.alive
