@@ -249,7 +249,7 @@ def describe_distance_change(before_cm: float | None, now_cm: float | None) -> s
     return f"its distance changed from {before_cm / 100:.2f} m to {now_cm / 100:.2f} m"
 
 
-def learn_trust(model: DriverClaims, log: CommandLog, event: TrustEvent, now: float, evidence: str = "") -> None:
+def update_trust(model: DriverClaims, log: CommandLog, event: TrustEvent, now: float, evidence: str = "") -> None:
     """Update the trust state of a car, and log each change."""
     trust = model.trust
     if trust.apply(event, now, evidence):

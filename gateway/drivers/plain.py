@@ -35,8 +35,8 @@ from gateway.control.driver import (
     Rejected,
     TextLine,
     describe_distance_change,
-    learn_trust,
     log_unstopped,
+    update_trust,
 )
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from schemas.car_profile import CarProfile
@@ -335,14 +335,14 @@ class PlainDriver(Driver):
         model = self._model
         model.link_open, model.link_since, model.heard_at = True, now, None
         self.senders.halt_streams(now)
-        self._learn(TrustEvent.LINK_OPENED, now)
+        self._update_trust(TrustEvent.LINK_OPENED, now)
         self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
         """Fail all commands, because the link is down."""
         model = self._model
         model.link_open, model.link_reason, self._renew_at = False, reason, float("inf")
-        self._learn(TrustEvent.LINK_LOST, now, reason)
+        self._update_trust(TrustEvent.LINK_LOST, now, reason)
         self._source = None
         stop, self._stop = self._stop, None
         words = f"NOT CONFIRMED: {model.name} became unreachable during the stop ({reason}). {self._when_cut}"
@@ -374,7 +374,7 @@ class PlainDriver(Driver):
         """Drop all commands, and bring the car to a known state."""
         self.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self.senders.halt_streams(now)
-        self._learn(event, now, words)
+        self._update_trust(event, now, words)
         if self._stop is None or self._stop.is_soft:
             self._begin(FrameOrigin.RECOVERY, now, [], is_soft=False)
         else:  # the frames of the running stop may be lost
@@ -476,7 +476,7 @@ class PlainDriver(Driver):
                 self._resend_at = float("inf") if self.RESEND_S is None else now + self.RESEND_S
                 self._renew_at = float("inf")
                 self._model.sent_motion = held.motion
-                self._learn(TrustEvent.MOTION_SENT, now)
+                self._update_trust(TrustEvent.MOTION_SENT, now)
                 if not held.pending.sent:
                     held.begin(now, self._model.range_cm)
                     self._log.record_sent(held.pending, now)
@@ -633,7 +633,7 @@ class PlainDriver(Driver):
                 running.began_at, running.is_late = now, False
             return
         self._stop = PlainStop(why, now, now, [*(running.commands if running is not None else ()), *commands], is_soft)
-        self._learn(TrustEvent.STOP_BEGUN, now, f"stop ({why})")
+        self._update_trust(TrustEvent.STOP_BEGUN, now, f"stop ({why})")
 
     def show_rest(self, words: str, now: float) -> None:
         """End the running stop if its frames are all written, because readings have shown that the car stands still.
@@ -645,12 +645,12 @@ class PlainDriver(Driver):
         if self._stop is not None and self._stop.last_at > float("-inf"):
             self._finish(self._stop, Basis.SHOWN, words, now)
         elif self._model.at_rest and not self._model.trust.shown:
-            self._learn(TrustEvent.STOP_SHOWN, now, words)
+            self._update_trust(TrustEvent.STOP_SHOWN, now, words)
 
     def _finish(self, stop: PlainStop, basis: Basis, words: str, now: float) -> None:
         model, shown = self._model, basis is Basis.SHOWN
         recovered, self._stop = not model.known, None
-        self._learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
+        self._update_trust(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
         if recovered:
             how = "is stopped (confirmed)" if shown else f"got its stop (not confirmed: {words})"
             self._log.log(Level.INFO, "recovered", f"{model.name} {how}, mode manual", now)
@@ -668,7 +668,7 @@ class PlainDriver(Driver):
         for pending in stop.commands:
             self._log.record(pending, Phase.FAILED, now, reason=Reason.NOT_SHOWN, words=words)
         stop.commands.clear()
-        self._learn(TrustEvent.NOT_SHOWN, now)
+        self._update_trust(TrustEvent.NOT_SHOWN, now)
         self._log.log(Level.ERROR, "not_shown", words, now)
 
     def worst_s(self, now: float) -> float:
@@ -694,5 +694,5 @@ class PlainDriver(Driver):
         self._not_stopped = why
         log_unstopped(self._log, self._model.name, why, now)
 
-    def _learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
-        learn_trust(self._model, self._log, event, now, evidence)
+    def _update_trust(self, event: TrustEvent, now: float, evidence: str = "") -> None:
+        update_trust(self._model, self._log, event, now, evidence)

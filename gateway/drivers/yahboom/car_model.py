@@ -9,7 +9,7 @@ from typing import Any
 
 from gateway.control.battery import Battery, BatteryPolicy
 from gateway.control.command_records import CommandLog
-from gateway.control.driver import Findings, Outputs, describe_distance_change, learn_trust
+from gateway.control.driver import Findings, Outputs, describe_distance_change, update_trust
 from gateway.control.trust import KNOWN, TrustEvent, TrustState
 from gateway.drivers.yahboom.estimate.learned import Learned
 from gateway.drivers.yahboom.estimate.mode import ModeEstimator
@@ -79,9 +79,9 @@ class CarModel:
         if profile.cells != self.battery.cells:
             self.battery = self._battery()
 
-    def learn(self, event: TrustEvent, now: float, evidence: str = "") -> None:
-        """Update the trust state, and log each change. Only this function changes it."""
-        learn_trust(self, self.log, event, now, evidence)
+    def update_trust(self, event: TrustEvent, now: float, evidence: str = "") -> None:
+        """Update the trust state, and log each change. Nothing else changes it."""
+        update_trust(self, self.log, event, now, evidence)
 
     @property
     def outputs(self) -> Outputs:

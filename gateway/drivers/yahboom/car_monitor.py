@@ -243,7 +243,7 @@ class CarMonitor:
         running = self._stops.running
         if running is None or running.case is cases.SOFT:
             self._stops.recover(now, words)
-        model.learn(TrustEvent.SILENT, now, words)
+        model.update_trust(TrustEvent.SILENT, now, words)
 
     def _on_contact(self, heard_at: float, now: float) -> None:
         """Stop the car when it reports again, because a stuck link may deliver all frames of the silence at once.
@@ -254,7 +254,7 @@ class CarMonitor:
         self._log.log(Level.INFO, "answers_again", words, now)
         self._executor.queue.drop(Phase.FAILED, Reason.LINK_DOWN, words, now)
         self._executor.senders.halt_streams(now)
-        self.model.learn(TrustEvent.HEARD, now, words)
+        self.model.update_trust(TrustEvent.HEARD, now, words)
         self.model.believed.allow_restart()
         self._executor.allow_for_lost_steps(heard_at)
         self._stops.on_contact(now, words)

@@ -78,7 +78,7 @@ class Executor(Driver):
         model.evidence.begin_link()
         model.pacing.reset()
         self.senders.halt_streams(now)
-        model.learn(TrustEvent.LINK_OPENED, now)
+        model.update_trust(TrustEvent.LINK_OPENED, now)
         self.stops.begin_recovery(FrameOrigin.RECOVERY, now, [])
 
     def link_down(self, reason: str, now: float, *, cause: Reason = Reason.LINK_DOWN) -> None:
@@ -87,7 +87,7 @@ class Executor(Driver):
         model.link_open = False
         model.link_reason = reason
         model.believed.repeat = False
-        model.learn(TrustEvent.LINK_LOST, now, reason)
+        model.update_trust(TrustEvent.LINK_LOST, now, reason)
         self.allow_for_lost_steps(model.mode.heard_at)
         self.mode_sent = self._source = None
         self.senders.halt_streams(now)  # a press from before the loss must not drive the car after it
@@ -525,12 +525,12 @@ class Executor(Driver):
         """
         self.model.rest_case = cases.ACTED
         words = cases.ACTED.why(self.model.name)
-        self.model.learn(TrustEvent.STOP_SENT, now, words)
+        self.model.update_trust(TrustEvent.STOP_SENT, now, words)
         self.stops.renewal.schedule(now)
 
     def _end_rest(self, event: TrustEvent, now: float) -> None:
         self.stops.renewal.reset()
-        self.model.learn(event, now)
+        self.model.update_trust(event, now)
 
     # ------------------------------------------------------------------ stops
 

@@ -86,7 +86,7 @@ class StopExecutor:
         """Begin to bring the car to a known state. Commands that wait for a running stop then wait for the recovery."""
         before = self.running
         why, commands = (before.why, before.commands) if before is not None else (FrameOrigin.RECOVERY, [])
-        self.model.learn(TrustEvent.DOUBTED, now, words)
+        self.model.update_trust(TrustEvent.DOUBTED, now, words)
         self.begin_recovery(why, now, commands)
 
     def begin_recovery(self, why: FrameOrigin, now: float, commands: list[Pending]) -> None:
@@ -111,7 +111,7 @@ class StopExecutor:
             case=self._case(sequence),
         )
         model.evidence.begin_stop()
-        model.learn(TrustEvent.STOP_BEGUN, now, f"{sequence.name} stop ({why})")
+        model.update_trust(TrustEvent.STOP_BEGUN, now, f"{sequence.name} stop ({why})")
 
     def _case(self, sequence: StopSequence) -> StopCase:
         """Return the case that decides when this stop may end although the car has not shown it."""
@@ -223,7 +223,7 @@ class StopExecutor:
         self._start(self.full(now), FrameOrigin.RECOVERY, now, [])
         assert self.running is not None
         self.running.overdue = self.running.repeats = True  # such a stop does not hold up the next drive
-        self.model.learn(TrustEvent.NOT_SHOWN, now, words)
+        self.model.update_trust(TrustEvent.NOT_SHOWN, now, words)
 
     def _try_again(self, running: StopInProgress, now: float) -> None:
         running.tries += 1
@@ -257,11 +257,11 @@ class StopExecutor:
                 self.model.evidence.reacted_at = None
                 self.model.missed_stop = True
                 self.model.learned.doubted = self.model.learned.shows is Shows.YES
-                self.model.learn(TrustEvent.NOT_SHOWN, now)
+                self.model.update_trust(TrustEvent.NOT_SHOWN, now)
                 self._log.log(Level.ERROR, "not_shown", words, now)
             elif self.model.trust.state is not CarTrust.UNHEARD:
                 words = f"{car} may still be moving: silent since the stop began. {goes_on}"
-                self.model.learn(TrustEvent.SILENT, now, words)
+                self.model.update_trust(TrustEvent.SILENT, now, words)
                 self._log.log(Level.WARNING, "unheard", words, now)
 
     def _may_be_unable_to_show(self, running: StopInProgress) -> bool:
@@ -381,7 +381,7 @@ class StopExecutor:
         model.rest_case = case
         model.cut_write = False
         self.renewal.left_mode = model.mode_closed_at >= running.began_at
-        model.learn(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
+        model.update_trust(TrustEvent.STOP_SHOWN if shown else TrustEvent.STOP_SENT, now, words)
         if recovered:
             how = "is stopped (confirmed)" if shown else f"got its stop (not confirmed: {words})"
             self._log.log(Level.INFO, "recovered", f"{model.name} {how}, mode manual", now)
