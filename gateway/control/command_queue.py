@@ -1,7 +1,8 @@
-"""Holds the commands in progress of one car: the held motion, the pending mode, and the queue of one-shots.
+"""Holds the commands in progress of one car: the held motion, the pending mode, and the actions on its parts.
 
-A one-shot is an action on a part of the car. The end of each command is recorded. The driver decides when a frame is
-written.
+An action on a part is, for example, a color, an angle of a servo, or the whistle. It may have several frames, with
+delays between them. This module decides which command is next, and records the end of each. The driver decides when its
+frame is written.
 """
 
 from collections import deque
@@ -54,19 +55,19 @@ class HeldMotion(Struct):
 
 
 class CommandQueue(Struct):
-    """At most one motion, at most one mode, and a queue of one-shots. Times: s, monotonic."""
+    """At most one motion, at most one mode, and a queue of actions on parts of the car. Times: s, monotonic."""
 
     log: CommandLog
     senders: Senders
     safety: Safety
     held: HeldMotion | None = None
     mode_change: Pending | None = None
-    one_shots: deque[Pending] = field(default_factory=deque)
+    part_actions: deque[Pending] = field(default_factory=deque)
 
     @property
     def has_commands(self) -> bool:
-        """Return True if there is a motion, a mode or a one-shot."""
-        return self.held is not None or self.mode_change is not None or bool(self.one_shots)
+        """Return True if there is a motion, a mode or an action."""
+        return self.held is not None or self.mode_change is not None or bool(self.part_actions)
 
     @property
     def held_until(self) -> float:
@@ -78,20 +79,20 @@ class CommandQueue(Struct):
         """Return when the queued commands expire, and when the held motion ends."""
         if not self.has_commands:
             return []
-        waiting = [*self.one_shots, *([self.mode_change] if self.mode_change is not None else [])]
+        waiting = [*self.part_actions, *([self.mode_change] if self.mode_change is not None else [])]
         times = [min(pending.waits_since + MAX_QUEUE_TIME_S, pending.sender_lost_at) for pending in waiting]
         return times if self.held is None else [*times, self.held_until]
 
     def expire(self, now: float) -> None:
-        """Expire the one-shots and the mode that have waited too long for a busy car.
+        """Expire the actions and the mode that have waited too long for a busy car.
 
         An action with many frames does not expire while they are written: the time counts anew for each frame.
         """
         words = f"the car was busy for {MAX_QUEUE_TIME_S:g} s"
-        for pending in [each for each in self.one_shots if now >= each.waits_since + MAX_QUEUE_TIME_S]:
+        for pending in [each for each in self.part_actions if now >= each.waits_since + MAX_QUEUE_TIME_S]:
             written, total = pending.frames_written, pending.frames_written + len(pending.frames)
             begun = f"only {written} of its {total} frames were sent: " if written else ""
-            self._end_part(pending, Phase.EXPIRED, Reason.EXPIRED, f"{begun}{words}", now)
+            self._end_part_action(pending, Phase.EXPIRED, Reason.EXPIRED, f"{begun}{words}", now)
         change = self.mode_change
         if change is not None and now >= change.sender_lost_at:  # nobody would be there to see the car drive off
             name = change.command.sender.text_name
@@ -101,39 +102,39 @@ class CommandQueue(Struct):
 
     # ------------------------------------------------------------------ actions on parts of the car
 
-    def add_part(self, pending: Pending, frames: Iterable[Any], part: Hashable, now: float) -> None:
+    def add_part_action(self, pending: Pending, frames: Iterable[Any], part: Hashable, now: float) -> None:
         """Queue an action on a part of the car. End an action on the same part that has delayed frames left."""
         words = f"another {pending.command.verb} by {pending.command.sender.text_name}"
-        for other in [each for each in self.one_shots if each.lasts and each.part == part]:
-            self._end_part(other, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        for other in [each for each in self.part_actions if each.lasts and each.part == part]:
+            self._end_part_action(other, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         pending.part = part
         pending.frames.extend(frames)
         pending.begin_delay(now)
-        self.one_shots.append(pending)
+        self.part_actions.append(pending)
 
     @property
     def turns(self) -> Iterator[Pending]:
         """Yield the actions whose frame may be written next: an action may overtake only those with a delay."""
-        for pending in self.one_shots:
+        for pending in self.part_actions:
             yield pending
             if not pending.is_delayed:
                 return
 
-    def next_part(self, now: float) -> Pending | None:
+    def next_part_action(self, now: float) -> Pending | None:
         """Return the action whose frame is due, if any."""
         return next((each for each in self.turns if now >= each.due_at), None)
 
     @property
-    def part_at(self) -> float:
+    def part_action_at(self) -> float:
         """Return when the next frame of an action is due, or inf if none waits."""
         return min((each.due_at for each in self.turns), default=float("inf"))
 
     @property
-    def has_undelayed(self) -> bool:
+    def has_undelayed_part_action(self) -> bool:
         """Return True if an action waits only for the car, and for no delay."""
-        return any(not each.is_delayed for each in self.one_shots)
+        return any(not each.is_delayed for each in self.part_actions)
 
-    def on_part_written(self, pending: Pending, now: float) -> None:
+    def on_part_action_written(self, pending: Pending, now: float) -> None:
         """Remove the frame of an action that was written. Record the action as sent.
 
         An action is recorded as sent at its first frame if there is a delay after that, else at its last frame.
@@ -148,19 +149,19 @@ class CommandQueue(Struct):
 
     def end_lasting(self, words: str, now: float) -> None:
         """End the actions that still have delayed frames, because another command takes their place."""
-        for pending in [each for each in self.one_shots if each.lasts]:
-            self._end_part(pending, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
+        for pending in [each for each in self.part_actions if each.lasts]:
+            self._end_part_action(pending, Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
 
-    def reject_part(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
+    def reject_part_action(self, pending: Pending, reason: Reason, words: str, now: float) -> None:
         """End an action that must not be carried out any more."""
-        self._end_part(pending, Phase.REJECTED, reason, words, now)
+        self._end_part_action(pending, Phase.REJECTED, reason, words, now)
 
-    def _end_part(self, pending: Pending, phase: Phase, reason: Reason, words: str, now: float) -> None:
+    def _end_part_action(self, pending: Pending, phase: Phase, reason: Reason, words: str, now: float) -> None:
         self._remove(pending)
         self.log.record(pending, phase, now, reason=reason, words=words)
 
     def _remove(self, pending: Pending) -> None:
-        self.one_shots = deque(each for each in self.one_shots if each is not pending)
+        self.part_actions = deque(each for each in self.part_actions if each is not pending)
 
     # ------------------------------------------------------------------ the end of commands
 
@@ -174,8 +175,8 @@ class CommandQueue(Struct):
         """End all commands."""
         self.close_held(phase, reason, words, now)
         self.close_mode_change(phase, reason, words, now)
-        while self.one_shots:
-            self.log.record(self.one_shots.popleft(), phase, now, reason=reason, words=words)
+        while self.part_actions:
+            self.log.record(self.part_actions.popleft(), phase, now, reason=reason, words=words)
 
     def close_held(
         self,

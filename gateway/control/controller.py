@@ -214,7 +214,7 @@ class Controller(Generic[D_co]):
             case Fan(bool() as on) if on == self.driver.model.outputs.fan:
                 return self._done(pending, f"the fan is {'on' if on else 'off'} already", now)
             case PartAction() | Find():
-                self._queue.add_part(pending, self.driver.frames(what), self.driver.part(what), now)
+                self._queue.add_part_action(pending, self.driver.frames(what), self.driver.part(what), now)
             case _:
                 assert_never(what)
         return self._queued(pending, now)
@@ -483,7 +483,7 @@ class Controller(Generic[D_co]):
         if command.streamed or (wait_s := self.wait_s(command.what, now)) < LATE_DRIVE_S:
             return ""
         if isinstance(command.what, SetMode):
-            after = " after the actions that wait" if self.driver.queue.has_undelayed else ""
+            after = " after the actions that wait" if self.driver.queue.has_undelayed_part_action else ""
             return f"opens in {wait_s:.1f} s at most{after}: {self.car} is stopped first"
         if words := self.driver.drive_wait_words(now):
             return f"begins after {words}"
@@ -606,7 +606,7 @@ class Controller(Generic[D_co]):
             authority=self.authority_at(now),
             ended=self.safety.ended,
             battery=self.driver.model.battery.refusal,
-            queued=len(self._queue.one_shots),
+            queued=len(self._queue.part_actions),
             loan_until=self.safety.loan_until,
             slept_at=self._slept_at,
             is_halted=is_halted,

@@ -32,7 +32,7 @@ from schemas.suggestion import did_you_mean
 from schemas.words import Mode, Motion, Rank, Reason
 
 MAX_QUEUED_COMMANDS: Final = 8
-"""Maximum one-shots in the queue. Further ones are refused."""
+"""Maximum actions on parts of the car in the queue. Further ones are refused."""
 MAX_AHEAD_S: Final = 5.0
 """Maximum time by which `asked` may lie in the future. The clocks of computers that use NTP differ by less."""
 CLOCK_DOUBT_S: Final = 30.0

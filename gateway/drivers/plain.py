@@ -221,7 +221,7 @@ class PlainDriver(Driver):
         self._model.speed = min(self._model.speed, desk.speed_max)
         self._stop: PlainStop | None = None
         self._source: PlainStop | HeldMotion | Pending | None = None
-        self._part_at = float("-inf")
+        self._part_action_at = float("-inf")
         """When the next frame of an action on a part of the car may be written."""
         self._resend_at = float("inf")
         """When the held motion is sent again."""
@@ -447,7 +447,7 @@ class PlainDriver(Driver):
 
     def _next_part(self, now: float) -> OutgoingFrame | None:
         """Return the next frame of an action on a part of the car, if one is due."""
-        if now < self._part_at or (pending := self.queue.next_part(now)) is None:
+        if now < self._part_action_at or (pending := self.queue.next_part_action(now)) is None:
             return None
         data, held = pending.next_frame, self.queue.held
         if isinstance(pending.command.what, ChangeSpeed):  # a frame for a speed repeats the present motion
@@ -481,8 +481,8 @@ class PlainDriver(Driver):
                     held.begin(now, self._model.range_cm)
                     self._log.record_sent(held.pending, now)
             case Pending():
-                self.queue.on_part_written(source, now)
-                self._part_at = now + (self.PART_GAP_S if source.frames and not source.is_delayed else 0.0)
+                self.queue.on_part_action_written(source, now)
+                self._part_action_at = now + (self.PART_GAP_S if source.frames and not source.is_delayed else 0.0)
                 self._apply(source.command.what, now)
             case None:
                 pass
@@ -511,15 +511,17 @@ class PlainDriver(Driver):
                 later += [stop.last_at + self.STOPS_WITHIN_S, stop.last_at + self.EVIDENCE_S]
                 times.append(self.setup_at())
                 if not self.wait_words(now):
-                    part_at = now if self._has_new_motion(stop) else max(self._part_at, self.queue.part_at)
-                    times.append(max(self.free_at(now), part_at))
+                    part_action_at = (
+                        now if self._has_new_motion(stop) else max(self._part_action_at, self.queue.part_action_at)
+                    )
+                    times.append(max(self.free_at(now), part_action_at))
             times += [each for each in later if each > now]
             return max(now, min(times))
         times.append(self.setup_at())
         if not self.wait_words(now):
             if held is not None and not held.pending.sent:
                 times.append(now)
-            times.append(max(self._part_at, self.queue.part_at))
+            times.append(max(self._part_action_at, self.queue.part_action_at))
             if held is not None:
                 times.append(self._resend_at)
             if self._model.at_rest and not self._model.trust.shown:

@@ -159,8 +159,8 @@ def _joystick(run: NormalRun) -> None:
 
 
 def _acts(run: NormalRun) -> None:
-    """Send one-shots of each kind, as fast as the queue takes them or slower."""
-    one_shots: tuple[Action, ...] = (
+    """Send actions on each kind of part, as fast as the queue takes them or slower."""
+    actions: tuple[Action, ...] = (
         Signal(Verb.WHISTLE),
         AimServo(run.moments.randint(0, 180)),
         MoveServo(run.moments.choice((ServoAction.FRONT_LEFT, ServoAction.FRONT_RESET))),
@@ -170,7 +170,7 @@ def _acts(run: NormalRun) -> None:
         Find(),
     )
     for _ in range(run.moments.randint(1, 25)):
-        run.ask(run.moments.choice(one_shots))
+        run.ask(run.moments.choice(actions))
         run.run(run.moments.choice((0.0, 0.35, 1.0)) + 0.01)
 
 

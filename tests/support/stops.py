@@ -144,7 +144,7 @@ def let_go(pair: Pair, moments: random.Random) -> None:
 
 
 def acting(pair: Pair, moments: random.Random) -> None:
-    """Queue one-shots of every kind while the car drives."""
+    """Queue actions on every part while the car drives."""
     pair.ask(Drive(Motion.FORWARD, 10.0))
     for what in (WHISTLE, AimServo(45), Led(255, 2, 3), WHISTLE, AimServo(120)):
         pair.ask(what)
@@ -152,7 +152,7 @@ def acting(pair: Pair, moments: random.Random) -> None:
 
 
 def one_shot(what: PartAction | Fan | Find | ChangeSpeed, block_s: float) -> Load:
-    """Return a load: a one-shot during a drive, from just before its frame to the end of its block."""
+    """Return a load: an action on a part during a drive, from just before its frame to the end of its block."""
 
     def load(pair: Pair, moments: random.Random) -> None:
         pair.ask(Drive(Motion.FORWARD, 10.0))

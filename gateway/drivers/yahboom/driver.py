@@ -175,7 +175,7 @@ class YahboomDriver(Executor):
     def _step_too_fast(self, step: SpeedStep) -> str | None:
         """Return why this step would make the car too fast, or None if it would not."""
         speeds = self.model.believed.speeds
-        for each in self.queue.one_shots:
+        for each in self.queue.part_actions:
             if isinstance(each.command.what, ChangeSpeed):  # it waits, and may be written before this one, or expire
                 speeds = joined(speeds, stepped(speeds, each.command.what.step))
         return self.too_fast(step, speeds)
@@ -234,7 +234,7 @@ class YahboomDriver(Executor):
 
     def _blinks(self) -> tuple[Frame, ...]:
         """Return the frames of `find`. The last one restores the LED color, or sets the color that was queued last."""
-        frames = [frame_of(each) for act in self.queue.one_shots for each in act.frames]
+        frames = [frame_of(each) for act in self.queue.part_actions for each in act.frames]
         waiting = [each for each in frames if isinstance(each, ColorLed)]
         led = waiting[-1] if waiting else self.model.believed.led
         other = ColorLed(255, 255, 255) if led != ColorLed(255, 255, 255) else ColorLed(0, 0, 0)

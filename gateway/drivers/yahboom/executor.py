@@ -154,11 +154,11 @@ class Executor(Driver):
             return self._next_of_drive(held, now)
         if (change := self._next_mode) is not None:
             return self._open_mode(change, now)
-        pending = None if self._actions_wait(now) else queue.next_part(now)
+        pending = None if self._actions_wait(now) else queue.next_part_action(now)
         if pending is not None and now >= self._act_at(pending) and self._may_overtake(pending):
             what = pending.command.what  # a drive may have lowered the speed since a step was accepted
             if isinstance(what, ChangeSpeed) and (words := self.too_fast(what.step, model.believed.speeds)):
-                queue.reject_part(pending, Reason.UNSUPPORTED, words, now)
+                queue.reject_part_action(pending, Reason.UNSUPPORTED, words, now)
                 return None
             frame = model.believed.with_motion(pending.next_frame)
             return self._prepare(frame, FrameOrigin.COMMAND, pending, pending)
@@ -244,7 +244,7 @@ class Executor(Driver):
             return None
         # Queued actions go before the mode, because the car would ignore them in the mode.
         stands = self.model.at_rest or self._full_stop_runs
-        return None if self.queue.has_undelayed and stands else change
+        return None if self.queue.has_undelayed_part_action and stands else change
 
     def _open_mode(self, pending: Pending, now: float) -> OutgoingFrame | None:
         """Open a mode, but stop the car first, because a mode that is opened during a drive leaves the motors on."""
@@ -294,14 +294,14 @@ class Executor(Driver):
     def _has_new_command(self, now: float) -> bool:
         """Return True if a command waits that may go before the repeats of the running stop."""
         held, change = self.queue.held, self.queue.mode_change
-        waiting = [self._next_mode] if self._actions_wait(now) else [change, self.queue.next_part(now)]
+        waiting = [self._next_mode] if self._actions_wait(now) else [change, self.queue.next_part_action(now)]
         if held is not None and not held.pending.sent:
             waiting.append(held.pending)
         return any(pending is not None and self._may_overtake(pending) for pending in waiting)
 
     def _actions_wait(self, now: float) -> bool:
         """Return True if actions on parts of the car wait, because they are in the way of something else."""
-        if not self.queue.one_shots:
+        if not self.queue.part_actions:
             return False
         stops = self._soft_stop_goes_first(now) or self._stop_goes_first(now) or self._renewal_goes_first(now)
         return stops or self._is_listening(now)
@@ -317,7 +317,7 @@ class Executor(Driver):
             return False
         if not (running.may_be_lost and not running.try_sent) and now >= self._soft_stop_read_at:
             return False
-        pending = self.queue.next_part(now)
+        pending = self.queue.next_part_action(now)
         return pending is not None and not isinstance(pending.next_frame, General)
 
     @property
@@ -462,7 +462,7 @@ class Executor(Driver):
                 if not source.frames_written:  # a command is one action: one that has begun does not wait for a stop
                     self._action_times.append(now)
                 self._can_wait_at = now
-                self.queue.on_part_written(source, now)
+                self.queue.on_part_action_written(source, now)
             case None:
                 self._can_wait_at = now
                 model.believed.repeat = False
@@ -626,7 +626,7 @@ class Executor(Driver):
         times: list[float] = []
         free_at = float("-inf") if self.accepts_commands(now) or running is None else running.gives_way_at
         actions_wait = self._actions_wait(now)
-        if queue.one_shots and self._next_mode is None and not actions_wait:
+        if queue.part_actions and self._next_mode is None and not actions_wait:
             times.extend(
                 max(each.due_at, self._act_at(each), model.mode_left_by, free_at)
                 for each in queue.turns

@@ -397,7 +397,7 @@ def test_loop_stall_stops_held_drive(desk: Workbench) -> None:
     assert len(desk.logs) == 1, "nothing is held now"
 
 
-# ---------------------------------------------------------------------- one-shots
+# ---------------------------------------------------------------------- actions on parts of the car
 
 
 def test_one_shot_queue_is_bounded_and_sends_each_once(desk: Workbench) -> None:

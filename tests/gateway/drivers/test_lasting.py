@@ -239,12 +239,12 @@ def test_begun_lasting_action_expiry() -> None:
     log = CommandLog()
     queue = CommandQueue(log, Senders(), Safety.restore(PersistedSafety(), 0.0, 0))
     pending = Pending(Command("it", "whistle", Sender(), MINUTE), 0.0)
-    queue.add_part(pending, ("on", Later("off", 40.0)), "lamp", 0.0)
-    queue.on_part_written(pending, 1.0)
+    queue.add_part_action(pending, ("on", Later("off", 40.0)), "lamp", 0.0)
+    queue.on_part_action_written(pending, 1.0)
     queue.expire(41.0 + MAX_QUEUE_TIME_S - 0.1)
     assert queue.deadlines() == [41.0 + MAX_QUEUE_TIME_S]
     queue.expire(41.0 + MAX_QUEUE_TIME_S)
     last = log.take_records()[-1]
     assert isinstance(last, CommandRecord)
     assert (last.phase, last.reason) == (Phase.EXPIRED, Reason.EXPIRED)
-    assert not queue.one_shots
+    assert not queue.part_actions
