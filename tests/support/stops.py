@@ -481,7 +481,7 @@ def state_of(pair: Pair) -> str:
         pacing = control.driver.model.pacing
         if control.driver.model.at_rest and control.driver.model.basis is Basis.SENT and pacing.is_blocked(now):
             return f"{kind[style]}at rest, a renewal blocks"  # the motors are off, so the ratio has no meaning
-        unread = "a frame may be unread" if not pacing.is_clear(now) else ""
+        unread = "a frame may be unread" if not pacing.has_read_all(now) else ""
         what = unread or ("in a block of ours" if pacing.is_blocked(now) else "nothing unread")
         return f"{kind[style]}{Mode.MANUAL}, {what}"
     if now < control.driver.model.pacing.block_until:

@@ -265,21 +265,21 @@ class CarModel:
     def for_stop(self, now: float) -> stop_choice.StopContext:
         """Return the context for the choice of a stop."""
         contradicted = self.mode.verdict is Verdict.CONTRADICTED
-        clear, blocked = self.pacing.is_clear(now), self.pacing.is_blocked(now)
+        has_read_all, blocked = self.pacing.has_read_all(now), self.pacing.is_blocked(now)
         return stop_choice.StopContext(
             self.profile,
             self.known,
             self.mode.asked,
             contradicted,
-            clear,
+            has_read_all,
             blocked,
             doubted=self.platform.doubted,
             open_mode=self.platform.open_mode,
-            clearing=self._clearing,
+            clearing_color=self._clearing_color,
         )
 
     @property
-    def _clearing(self) -> ColorLed | None:
+    def _clearing_color(self) -> ColorLed | None:
         """Return the color frame that clears a string beginning with `4WD,`, if the car may hold such a string."""
         suspected = self.cut_write or (self.learned.shows is Shows.YES and self.trust.state is CarTrust.UNPROVEN)
         color = self.believed.led

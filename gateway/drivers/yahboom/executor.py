@@ -1,7 +1,32 @@
-"""Sends frames to one car: one at a time, the first frames of a stop before everything else. Pure.
+"""Chooses the next frame for one car: `Executor.poll` is asked whenever something could be written. Pure.
 
-`StopExecutor` knows which frames a stop needs, `CommandQueue` has the other waiting commands, and `Pacing` knows when a
-frame may be written.
+Three others are asked: `StopExecutor` knows which frames a stop needs, `CommandQueue` has the commands that wait, and
+`Pacing` knows when the car can take a frame. What is left for this module is the order, and that is the difficult part,
+because the car does one thing at a time and loses what comes too early.
+
+*Stops.* The first frames of a stop go before everything else, because people stand beside the car. If the car then has
+to show that it stands, the stop goes on for seconds: it waits for reports, and is sent again. A person who has stopped
+a car and wants to drive it must not wait for all that. So from `accepts_commands` on, a command that is newer than the
+stop takes the place of its further tries (`_may_overtake`). The end of a drive (a soft stop) gives way even earlier,
+because the frame of any command ends the old motion, too.
+
+*Commands.* Of the commands that wait, a drive goes first, then a mode, then the actions on parts of the car, such as
+colors. There is one exception: if the car is at rest, actions that were queued before a mode go before it, because a
+car in a mode ignores them. Only if no command waits, a motion is repeated, or a stop that nothing has shown is renewed.
+
+*Actions that wait.* One action is usually written at once, even during a stop. But a program that sends a color every
+0.3 s would put off the repeats of a lost stop for ever. Its blocks would also excuse the silence of a car that is gone,
+and would change the times of the reports that show a stop. So `_actions_wait` holds actions back. After `FREE_ACTIONS`
+of them, the next ones wait for a stop (`_stop_goes_first`), and for the report that shows that the car is still there
+(`_is_listening`). If they have held up the renewal of a stop, they wait for it (`_renewal_goes_first`). And even a
+single color waits for the end of a drive (`_soft_stop_goes_first`), because a car that reads it in one string with the
+stop ignores the stop.
+
+*Steps of the speed.* A car that may be too fast for `speed_max` first gets steps of its speed, and each of them must be
+read alone: a lost step would let the car drive too fast. So the drive waits for them (`_drive_at`).
+
+`next_at` tells the loop when `poll` may have something to do. It follows the same order, and a change of one is a
+change of both.
 """
 
 from collections import deque
@@ -53,9 +78,9 @@ class Executor(Driver):
         """The stop, motion or command of the frame that `poll` last returned. None for a repetition."""
         self._action_times: deque[float] = deque(maxlen=FREE_ACTIONS)
         """When the first frames of the last actions on parts of the car were written."""
-        self._can_wait_at = float("-inf")
-        """When the last frame was written that an action must not join in the car's buffer: another action, a repeated
-        motion, or a renewed stop."""
+        self._must_not_join_at = float("-inf")
+        """When a frame was last written that the next action must not join in the car's buffer: another action, a
+        repeated motion, or a renewed stop."""
         self._steps_written: deque[tuple[float, Speeds]] = deque(maxlen=STEPS_KEPT)
         """When the last steps of the speed were written, and the speeds before them."""
         self._in_write: Frame | None = None
@@ -146,6 +171,7 @@ class Executor(Driver):
         return self._prepare(frame, running.why, running, running.commands[0] if running.commands else None)
 
     def _next_command(self, now: float) -> OutgoingFrame | None:
+        """Return the next frame that belongs to no stop in progress: of a command, or a repeat."""
         model, queue = self.model, self.queue
         if now < model.ready_at:
             return None
@@ -233,7 +259,7 @@ class Executor(Driver):
         # then takes long. If it reads while this frame arrives behind an unread one, it takes the rest of this frame
         # for the next string, and a digit in it may start the motors.
         pacing = self.model.pacing
-        may_join = self._can_wait_at == pacing.written_at and self.model.is_without_echo
+        may_join = self._must_not_join_at == pacing.written_at and self.model.is_without_echo
         return pacing.act_at(pending.next_frame, alone=may_join)
 
     @property
@@ -461,10 +487,10 @@ class Executor(Driver):
                     self.stops.running.on_other_written(now)
                 if not source.frames_written:  # a command is one action: one that has begun does not wait for a stop
                     self._action_times.append(now)
-                self._can_wait_at = now
+                self._must_not_join_at = now
                 self.queue.on_part_action_written(source, now)
             case None:
-                self._can_wait_at = now
+                self._must_not_join_at = now
                 model.believed.repeat = False
 
     def allow_for_lost_steps(self, since: float) -> None:
@@ -608,6 +634,7 @@ class Executor(Driver):
         return max(now, min(times, default=float("inf")))
 
     def _command_times(self, now: float) -> list[float]:
+        """Return when `_next_command` may have a frame."""
         model, queue, running = self.model, self.queue, self.stops.running
         if running is not None and self.stops.shutting_down:
             return []

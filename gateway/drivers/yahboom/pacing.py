@@ -160,10 +160,10 @@ class Pacing:
     def is_blocked(self, now: float) -> bool:
         """Return True if the car is certainly acting on our last frame, not still ranging with the frame unread."""
         running = self._sure_block_s > FLIGHT_S and now < self._written_at + self._sure_block_s
-        return running and self._earlier_block_s == 0.0 and self.is_clear(now)
+        return running and self._earlier_block_s == 0.0 and self.has_read_all(now)
 
-    def is_clear(self, now: float) -> bool:
-        """Return True if the car will have read all our frames before the next one is sent."""
+    def has_read_all(self, now: float) -> bool:
+        """Return True if the car has read all our frames by the time at which the next one can be sent."""
         return self._read_by <= max(now, self.ready_at(Gate.FLIGHT))
 
     def ready_at(self, gate: Gate) -> float:

@@ -332,7 +332,7 @@ class StopEvidence(Struct):
             self._echo_report_at = at if has_echo else None
             self._ended_with_echo = has_echo
             self._blocks, self._other_frame_written = [], False
-            return self._on_obeyed(at)
+            return self._on_shown(at)
         self.settles_at = None
         if not is_report:
             self._on_other_mode(at)
@@ -362,7 +362,7 @@ class StopEvidence(Struct):
         self.without_echo = 0 if has_echo else self.without_echo + 1
         left = self._judge_leaving(at, silence_s, self._leaving_s + ranging_s)
         if left is Finding.SHOWN:
-            return self._on_obeyed(at)
+            return self._on_shown(at)
         if not has_echo:
             return self._on_report_without_echo(before_no_echo, at, blocks)
         if left is Finding.BLOCK_GAP:
@@ -395,7 +395,7 @@ class StopEvidence(Struct):
         if self.settles_at is None or now < self.settles_at:
             return False
         self.settles_at = None
-        self._on_obeyed(self._last_at)
+        self._on_shown(self._last_at)
         return True
 
     @property
@@ -571,7 +571,7 @@ class StopEvidence(Struct):
         self._block_gaps = 1
         return Finding.BLOCK_GAP
 
-    def _on_obeyed(self, at: float) -> Finding:
+    def _on_shown(self, at: float) -> Finding:
         """Begin anew, because the stop is shown."""
         self.reacted_at = at
         self._mode_00_at = None

@@ -47,16 +47,17 @@ class StopContext(Struct, frozen=True):
     mode: Mode | None
     """The last commanded mode."""
     contradicted: bool
-    clear: bool
-    """True if the car has read all our frames before the first frame of the stop is written."""
+    has_read_all: bool
+    """True if the car has read all our frames by the time at which the first frame of the stop can be written."""
     blocked: bool = False
     """True if our last frame is blocking the car in mode 0. The car does not range directly after such a block."""
     doubted: bool = False
     """True if readings contradict the platform, so the car needs a stop that works on any platform."""
     open_mode: bool = False
     """True if readings show a mode other than 0."""
-    clearing: ColorLed | None = None
-    """The last color, if the car may hold a string that only a color frame clears."""
+    clearing_color: ColorLed | None = None
+    """The color frame to send in a recovery, if the car may hold a string that nothing else clears. It has the last
+    color, so that nobody sees a change."""
 
     @property
     def style(self) -> StopStyle:
@@ -86,7 +87,7 @@ def recovery(context: StopContext) -> StopSequence:
         case StopStyle.BOTH:
             return sequences.BOTH
         case StopStyle.MODE_FRAME | StopStyle.TIMER:
-            return sequences.RECOVERY if context.clearing is None else sequences.clearing(context.clearing)
+            return sequences.RECOVERY if context.clearing_color is None else sequences.clearing(context.clearing_color)
 
 
 def full(context: StopContext) -> StopSequence:
@@ -100,7 +101,7 @@ def full(context: StopContext) -> StopSequence:
         return sequences.FULL_MODE
     if style is StopStyle.TIMER:
         return sequences.GENERAL  # `MODE00` would show nothing, and turn the LED off
-    return sequences.FULL if context.clear else sequences.FULL_BEHIND
+    return sequences.FULL if context.has_read_all else sequences.FULL_BEHIND
 
 
 def soft(context: StopContext) -> StopSequence:
@@ -120,7 +121,7 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
     flight_s = max(pacing.ready_at(Gate.FLIGHT) - now, 0.0)
     block_s = max(pacing.block_until - now, 0.0)
     ranging_s = FRAME_S if context.blocked else context.profile.mode_turn_s(Mode.MANUAL)
-    lost_s = 0.0 if context.clear else REPEAT_INTERVAL_S
+    lost_s = 0.0 if context.has_read_all else REPEAT_INTERVAL_S
     if sequence in (sequences.FULL, sequences.FULL_MODE):
         alone_s = max(pacing.buffer_until - now, 0.0)
         if not context.manual and now + alone_s + IN_TIME_S < pacing.earliest_block_end:
@@ -139,8 +140,8 @@ def worst_s(sequence: StopSequence, context: StopContext, pacing: Pacing, now: f
     if sequence is sequences.GENERAL and not context.known and context.profile.kind is not Platform.RASPBERRY_PI:
         lost_s = REPEAT_INTERVAL_S  # the first two frames are lost if the car has half a frame in its buffer
         return flight_s + FRAME_S + lost_s + ranging_s + WIRE_S
-    begins_with_one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.clear and context.known)
+    begins_with_one = sequence in (sequences.SOFT, sequences.FULL_BEHIND) or (context.has_read_all and context.known)
     second_s = 0.0 if begins_with_one else FRAME_S  # of two frames, the car may read only the second
-    if context.clear:
+    if context.has_read_all:
         return max(flight_s + second_s + ranging_s, block_s + FRAME_S) + WIRE_S
     return max(flight_s + second_s + lost_s, block_s) + ranging_s + WIRE_S

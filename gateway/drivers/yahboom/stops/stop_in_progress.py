@@ -69,6 +69,7 @@ class StopInProgress(Struct):
     """When the current try begins. Frames of other commands put it off."""
     commands: list[Pending] = field(default_factory=list)
     index: int = 0
+    """Number of frames of the current try that are written."""
     try_decided_at: float = float("-inf")
     """When the current try was decided on."""
     first_at: float | None = None

@@ -212,9 +212,9 @@ def situations() -> list[stop_choice.StopContext]:
     """Return all combinations of the inputs of the choice."""
     return [
         stop_choice.StopContext(
-            parse_platform(platform), known, mode, contradicted, clear, blocked, doubted=doubted, open_mode=open_mode
+            parse_platform(platform), known, mode, contradicted, all_read, blocked, doubted=doubted, open_mode=open_mode
         )
-        for platform, known, mode, contradicted, clear, blocked, doubted, open_mode in product(
+        for platform, known, mode, contradicted, all_read, blocked, doubted, open_mode in product(
             Platform, FLAGS, (None, *Mode), FLAGS, FLAGS, FLAGS, FLAGS, FLAGS
         )
     ]
@@ -244,7 +244,7 @@ FULL: tuple[tuple[Callable[[stop_choice.StopContext], bool], sequences.StopSeque
     (lambda it: not it.known, sequences.RECOVERY),
     (lambda it: not certain(it), sequences.FULL_MODE),
     (lambda it: it.profile.kind is Platform.STM32, sequences.GENERAL),
-    (lambda it: not it.clear, sequences.FULL_BEHIND),
+    (lambda it: not it.has_read_all, sequences.FULL_BEHIND),
     (lambda it: True, sequences.FULL),
 )
 
@@ -288,7 +288,7 @@ def test_announced_time_is_never_less_than_waited() -> None:
         for ago_s in (0.0, 0.05, 0.3, 1.0, 2.0, 9.0):
             pacing = Pacing(each.profile, Learned())
             pacing.on_written(sequences.SOFT.steps[0].frame, 100.0 - ago_s)
-            situation = replace(each, clear=pacing.is_clear(100.0), blocked=False)
+            situation = replace(each, has_read_all=pacing.has_read_all(100.0), blocked=False)
             for recipe in (stop_choice.full(situation), stop_choice.soft(situation)):
                 worst_s = stop_choice.worst_s(recipe, situation, pacing, 100.0)
                 assert worst_s >= max(0.0, pacing.ready_at(recipe.steps[0].gate) - 100.0) + stop_choice.WIRE_S
