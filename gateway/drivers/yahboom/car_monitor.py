@@ -69,24 +69,38 @@ class CarMonitor:
 
     def on_event(self, event: Event, now: float) -> None:
         """Update the model with an event of the decoder."""
+        is_credible = not isinstance(event, Sensors) or self.model.evidence.is_credible(event)
+        self._update_platform(event, now, counts=is_credible)
+        if isinstance(event, Rejected) and event.raw.strip():  # some cars end a frame with CR and LF
+            self.model.evidence.on_noise(event.at, damaged=event.cause is not Cause.NO_START)
+        if isinstance(event, Sensors):
+            self._on_reading(event, now, counts=is_credible)
+
+    def _update_platform(self, event: Event, now: float, *, counts: bool) -> None:
+        """Look at what an event says about the program of the car. Stop the car if its last stop did not fit that.
+
+        With `counts` False, the event is a reading that may be damaged.
+        """
         model = self.model
-        is_credible = not isinstance(event, Sensors) or model.evidence.is_credible(event)
         was_open = model.platform.open_mode
-        contradictions = model.platform.on_event(event, counts=is_credible)
+        contradictions = model.platform.on_event(event, counts=counts)
         if model.platform.open_mode and not was_open and model.profile.stop_style is StopStyle.GENERAL:
             self._stops.leave_open_mode(now)
         for words in contradictions:
             self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
             if model.platform.doubted:  # the last stop may have been of the wrong kind for this car
                 self._on_other_program(now, words)
-        if isinstance(event, Rejected) and event.raw.strip():  # some cars end a frame with CR and LF
-            model.evidence.on_noise(event.at, damaged=event.cause is not Cause.NO_START)
-        if not isinstance(event, Sensors):
-            return
+
+    def _on_reading(self, event: Sensors, now: float, *, counts: bool) -> None:
+        """Update mode, evidence and learned habits with a reading, and let the stop in progress act on the finding.
+
+        With `counts` False, the reading may be damaged, and says nothing about the mode.
+        """
+        model = self.model
         was_silent = self._silent_since is not None or model.trust.state is CarTrust.UNHEARD
         before, silent_s = model.mode.verdict, model.mode.unheard_s(event.at) if was_silent else 0.0
         heard_at = model.mode.heard_at
-        model.mode.on_reading(event, counts=is_credible)
+        model.mode.on_reading(event, counts=counts)
         self._log_contradiction(before, now)
         self._record_effect(event, now)
         # Stop the car after a silence, because a command may have been sent during it.
@@ -97,16 +111,21 @@ class CarMonitor:
             model.mode.allow_silence(silent_s)
             self._on_contact(heard_at, now)
         finding = model.evidence.on_reading(event)
-        if Blocking.MODE_CLOSE in model.learned.blocks and model.stop_style is StopStyle.TIMER:
-            words = f"its reports come late after MODE00, unlike those of {model.profile.name} cars"
-            if model.platform.note(words):
-                self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
+        self._check_timer(now)
         if only_candidate(event) is Mode.MANUAL:
             self._on_report(event, now)
         self._log_delivery(finding, now)
         self._stops.on_finding(finding, event.at, now)
         if model.evidence.changed_expectation:
             self._on_changed_expectation(now)
+
+    def _check_timer(self, now: float) -> None:
+        """Note a contradiction if `MODE00` delays the reports of a car whose platform reports by a timer."""
+        model = self.model
+        if Blocking.MODE_CLOSE in model.learned.blocks and model.stop_style is StopStyle.TIMER:
+            words = f"its reports come late after MODE00, unlike those of {model.profile.name} cars"
+            if model.platform.note(words):
+                self._log.log(Level.WARNING, "platform_contradicted", f"{model.name}: {words}", now)
 
     def _on_report(self, event: Sensors, now: float) -> None:
         """Update the model with a report of mode 0."""

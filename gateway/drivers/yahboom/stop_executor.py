@@ -1,6 +1,23 @@
 """Carries out the stops of one car: repeats each until the car has shown it, or it is clear that the car cannot. Pure.
 
-Two other classes help: `Executor` writes the frames, and `CarMonitor` reports what the car's readings show.
+There is at most one stop at a time (`StopInProgress`). Whoever asks for a stop while one is in progress joins it,
+unless the new one is stronger and replaces it. `Executor` writes the frames, and `CarMonitor` reports what the readings
+of the car show.
+
+*Tries.* A try is a sequence of frames, which `stop_choice` has chosen, and the wait for a report after them. If nothing
+has shown the stop by then, the next try begins. It is a recovery, because by now nobody knows which frames the
+car has read. There may be any number of tries.
+
+*The end.* A stop is over if the evidence shows it (see stops/evidence.py), or if the car cannot show it: then its case
+says when it ends as sent (see stops/cases.py). It is also over if a newer command takes its place, if the link is lost,
+or if the time of a shutdown is over. No other time ends a stop. `fail_late` fails the commands that wait for it, so
+that a person learns that nothing has shown it. But the stop goes on, as an overdue one.
+
+*Probes.* A car in mode 0 shows a stop only by two late reports, each after a `MODE00` of its own. So `on_finding` sends
+such a `MODE00` as a test frame (a probe), or a control that tells a late report from a lost one.
+
+*Afterwards.* A stop that has ended as sent may not have arrived. So `renewal` repeats it for as long as the car is at
+rest, at a slower pace, and without anybody who waits for it.
 """
 
 from typing import Final
@@ -355,8 +372,8 @@ class StopExecutor:
     def _handle_loss(self, running: StopInProgress, now: float) -> None:
         """Send the stop again at once, because the reports have continued without a block gap.
 
-        Do so only in the first try, and only if the case of the stop allows it. The case of a Raspberry Pi does not,
-        because its reports always continue.
+        Do so only in the first try, and only if the case of the stop allows it. The case of a car that contradicts its
+        platform does not: it may be a Raspberry Pi, whose reports always continue.
         """
         running.probes += 1
         if (
