@@ -386,8 +386,8 @@ class Fleet:
         self.check_open()
         cars = [cars] if isinstance(cars, str) else cars  # "red" is an Iterable[str], too: r, e, d
         named = None if cars is None else list(dict.fromkeys(keys.check_name(car) for car in cars))
-        message, command_id = self._fill(request)
-        payload = message.SerializeToString()
+        message = self._fill(request)
+        command_id, payload = message.id, message.SerializeToString()
         pool = self._stop_pool if request.until is Until.STOPPED else self._pool
 
         def send_again(car: str) -> None:
@@ -435,7 +435,8 @@ class Fleet:
             command_log.info("%s: %s %s", each.car, command.request.verb, each.phase, extra=extra)
         return found
 
-    def _fill(self, request: CommandRequest) -> tuple[Any, str]:
+    def _fill(self, request: CommandRequest) -> Any:
+        """Return the message of a request, with its id, sender and time."""
         message = type(request.message)()
         message.CopyFrom(request.message)
         message.id = uuid.uuid4().hex
@@ -443,12 +444,13 @@ class Fleet:
         message.kind = self.kind
         message.take = request.take
         message.asked.seconds, message.asked.nanos = divmod(time.time_ns(), 1_000_000_000)
-        return message, message.id
+        return message
 
     def _query(self, target: str, command: PendingCommand, payload: bytes) -> None:
         """Send the command to one car, or to all, and queue the answers. Runs on a thread of the pool."""
         verb = command.request.verb
-        # The text is used only for cars that have not answered. For all cars, each one's name replaces the `*`.
+        # Why a car has not answered: this, unless the query itself says more. If the target is `*`, the tracker puts
+        # the name of each car there.
         why_silent = f"{target} may or may not carry it out: its gateway ended without an answer. Look at the car."
         try:
             answers = self.bus.query(

@@ -108,7 +108,7 @@ class PendingCommand:
         self._is_closed = False
         self._late_at: float | None = self._asked_at + ANSWER_TIMEOUT_S
         """Time of the warning about missing answers. None after the warning."""
-        self._waits_said: set[str] = set()
+        self._told_to_wait: set[str] = set()
         """Busy cars that were named in a message."""
         self._progress: dict[str, Progress] = {}
         for car in present if named is None else named:
@@ -134,34 +134,37 @@ class PendingCommand:
                 self._note_arrival(arrived=not self.lost_bus and not self._is_closed)
                 return
             now = time.monotonic()
-            if self._late_at is not None and now >= self._late_at:
-                self._late_at = None
-                self._warn_of_missing_answers(waiting)
-            waits_at = self._asked_at + WAIT_SAID_S
-            if now >= waits_at:
-                self._warn_of_waits(waiting)
-            for progress in waiting:
-                if progress.is_awaited and now >= progress.deadline and not progress.awaits_bus:
-                    link = self._read_link()
-                    if link != self._link_when_gone.get(progress.car, self._link_then):
-                        # The gateway may still be there, because our own link was lost. Give it more time, but only
-                        # once for each loss of our link.
-                        self._link_when_gone[progress.car] = link
-                        progress.on_presence(now, alive=True)
-                if now >= progress.deadline and self.inbox.empty():  # after a stall of this thread, it may be there
-                    progress.give_up(now)
-            due = [each.deadline for each in waiting] or [now + ANSWER_TIMEOUT_S]
-            if self._late_at is not None:
-                due.append(self._late_at)
-            if now < waits_at:
-                due.append(waits_at)
-            if self.is_stop and (self._awaits_bus or not all(each.answered for each in waiting)):
-                due.append(now + BUS_LOOK_INTERVAL_S)
+            self._warn(waiting, now)
+            self._give_up_late(waiting, now)
             try:
-                at, item = self.inbox.get(timeout=max(0.0, min(due) - now))
+                at, item = self.inbox.get(timeout=max(0.0, self._next_look_at(waiting, now) - now))
             except queue.Empty:
                 continue
             self._handle(item, at)
+
+    def _give_up_late(self, waiting: list[Progress], now: float) -> None:
+        """Give up the cars whose deadline has passed."""
+        for progress in waiting:
+            if progress.awaits_gateway and now >= progress.deadline and not progress.awaits_bus:
+                link = self._read_link()
+                if link != self._link_when_gone.get(progress.car, self._link_then):
+                    # The gateway may still be there, because our own link was lost. Give it more time, but only once
+                    # for each loss of our link.
+                    self._link_when_gone[progress.car] = link
+                    progress.on_presence(now, alive=True)
+            if now >= progress.deadline and self.inbox.empty():  # after a stall of this thread, it may be there
+                progress.give_up(now)
+
+    def _next_look_at(self, waiting: list[Progress], now: float) -> float:
+        """Return when `wait` has something to do, even if nothing arrives earlier."""
+        due = [each.deadline for each in waiting] or [now + ANSWER_TIMEOUT_S]
+        if self._late_at is not None:
+            due.append(self._late_at)
+        if now < (waits_at := self._asked_at + WAIT_SAID_S):
+            due.append(waits_at)
+        if self.is_stop and (self._awaits_bus or not all(each.answered for each in waiting)):
+            due.append(now + BUS_LOOK_INTERVAL_S)
+        return min(due)
 
     def abandon(self) -> None:
         """Make `wait` return at once, because nobody needs the outcome any more.
@@ -208,6 +211,14 @@ class PendingCommand:
         if not self.arrived.done():
             self.arrived.set_result(arrived)
 
+    def _warn(self, waiting: list[Progress], now: float) -> None:
+        """Tell the user what the command still waits for, each thing once."""
+        if self._late_at is not None and now >= self._late_at:
+            self._late_at = None
+            self._warn_of_missing_answers(waiting)
+        if now >= self._asked_at + WAIT_SAID_S:
+            self._warn_of_waits(waiting)
+
     def _warn_of_missing_answers(self, waiting: list[Progress]) -> None:
         if late := sorted(progress.car for progress in waiting if not progress.answered):
             why = "The fleet's bus does not answer" if self.lost_bus else "Computer or gateway may be overloaded"
@@ -215,9 +226,9 @@ class PendingCommand:
 
     def _warn_of_waits(self, waiting: list[Progress]) -> None:
         for progress in waiting:
-            if progress.waits and progress.car not in self._waits_said:
-                self._waits_said.add(progress.car)
-                log.warning("%s: %s", progress.car, progress.waits)
+            if progress.why_waiting and progress.car not in self._told_to_wait:
+                self._told_to_wait.add(progress.car)
+                log.warning("%s: %s", progress.car, progress.why_waiting)
 
     def _handle(self, item: Any, at: float) -> None:
         if item is CLOSED:
@@ -262,7 +273,7 @@ class PendingCommand:
             if change.alive and self.lost_bus and self._named is None:
                 self._stop_again(self._of(change.car))
             return
-        was_awaited = progress.is_awaited
+        was_awaited = progress.awaits_gateway
         progress.on_presence(at, alive=change.alive)
         if change.alive and was_awaited:
             self._stop_again(progress)
@@ -301,6 +312,7 @@ class PendingCommand:
         progress.on_answer(answer.status, answer.reason, answer.words, answer.worst_case_s, at)
 
     def _of(self, car: str) -> Progress:
+        """Return the progress of the command on this car. A car that was not known to be concerned is from now on."""
         if car not in self._progress:
             request = self.request
             self._progress[car] = Progress(

@@ -46,7 +46,7 @@ class CommandRequest(Struct, frozen=True):
 
     @property
     def effect_verb(self) -> str:
-        """The verb in `effects.EFFECTS`."""
+        """The verb for `outcome_words`. An e-stop of all cars has other texts there, and so has a drive that stops."""
         if self.verb == Verb.ESTOP and self.message.scope == Scope.FLEET:
             return ESTOP_FLEET
         return RELEASE if self.verb == Verb.DRIVE and self.until is Until.STOPPED else self.verb

@@ -136,7 +136,7 @@ class Progress:
         self._timeout_from = asked_at
         self._worst_case_s = 0.0
         self._queued = False
-        self.waits = ""
+        self.why_waiting = ""
         """Why the command waits for its car, and for how long at most, in the gateway's words. Empty once its frame is
         sent."""
         self._sent_event = False
@@ -144,23 +144,23 @@ class Progress:
         self._is_supervised = False
         self._foreign = ""
         """The text about another program that answered."""
-        self._unanswered = ""
+        self._why_unanswered = ""
         """Why the last query of a stop ended without an answer."""
         self._bus_lost_until: float | None = None
         """The time to give up, for a stop that had no answer when the bus was lost."""
 
     @property
-    def is_awaited(self) -> bool:
-        """True if the gateway is gone and may come back."""
+    def awaits_gateway(self) -> bool:
+        """True while the gateway is gone, and may still come back."""
         return self.outcome is None and self._gone_at is not None
 
     @property
     def awaits_bus(self) -> bool:
-        """True if this is a stop that is sent again once the bus is back."""
+        """True while the bus is gone, and this is a stop that is sent again when it is back."""
         return self.outcome is None and self._bus_lost_until is not None and not self.answered
 
     @property
-    def _joined(self) -> bool:
+    def _extends_drive(self) -> bool:
         """True if the command extends a running drive. An older gateway sends no event when that drive ends.
 
         A drive that begins is queued before it is sent. An extension is sent without being queued.
@@ -177,7 +177,7 @@ class Progress:
             return self._gone_at + (GATEWAY_RESTART_TIMEOUT_S if self._is_supervised else GATEWAY_RETURN_TIMEOUT_S)
         if not self.answered:
             return self._asked_at + OVERLOAD_ANSWER_TIMEOUT_S + OUTCOME_MARGIN_S
-        if self._joined:
+        if self._extends_drive:
             return self._timeout_from + self._duration_s + OUTCOME_MARGIN_S
         wait_s = {
             Until.SENT: MAX_QUEUE_TIME_S,
@@ -250,7 +250,7 @@ class Progress:
         if self._is_supervised and not self.answered:
             self.on_presence(at, alive=False)
         elif self._verb in STOP_VERBS and not self.answered:  # the gateway or the bus may be back in a moment
-            self._unanswered = f"{self._foreign}. {words}" if self._foreign else words
+            self._why_unanswered = f"{self._foreign}. {words}" if self._foreign else words
             self.on_presence(at, alive=False)
         else:
             self._give_up_unanswered(words, at)
@@ -284,8 +284,8 @@ class Progress:
         if self.awaits_bus:
             self._end(NO_ANSWER, "", bus_lost_words(self.car), at, ok=False)
             return
-        if self._unanswered and not self.answered:
-            self._end(NO_ANSWER, "", self._unanswered, at, ok=False)
+        if self._why_unanswered and not self.answered:
+            self._end(NO_ANSWER, "", self._why_unanswered, at, ok=False)
             return
         if self._gone_at is not None:
             words = (
@@ -294,7 +294,7 @@ class Progress:
             )
             self._end(self._phase, "", words, at, ok=False)
             return
-        if self._joined:
+        if self._extends_drive:
             self._basis = Basis.SENT
             self._end(Phase.SENT, "", "the running drive was extended", at, ok=True)
             return
@@ -310,9 +310,9 @@ class Progress:
         self._last_event_at = at
         self._queued = self._queued or phase == Phase.QUEUED
         if phase == Phase.QUEUED and not self._sent_event:
-            self.waits = words or self.waits
+            self.why_waiting = words or self.why_waiting
         elif phase != Phase.ASKED:
-            self.waits = ""
+            self.why_waiting = ""
         was_overtaken = phase in (Phase.ASKED, Phase.QUEUED) and self._phase in (Phase.SENT, Phase.COMPLETE)
         if not was_overtaken:
             self._phase = phase

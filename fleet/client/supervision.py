@@ -14,14 +14,19 @@ from schemas.words import ProcessKind, RunState
 SUPERVISOR_STATUS: Final = topics.TOPICS[f"{keys.SUPERVISOR}/status"]
 MAX_GROUPS: Final = 64
 """Maximum number of groups that are used from a status. There is a limit because anybody may publish a status."""
-COLORS_TIMEOUT_S: Final = 0.5
-"""Timeout for the colors of the cars: a supervisor that hangs must not delay a table."""
+BRIEF_TIMEOUT_S: Final = 0.5
+"""Timeout for what is nice to know, such as the colors of the cars: a supervisor that hangs must not delay a table."""
 
 
 def ask_status(bus: Bus, fleet: str, timeout_s: float = 2.0) -> list[Any]:
     """Return the fleet.v1.Supervision of every supervisor that answers."""
     answers = bus.query(f"{fleet}/{SUPERVISOR_STATUS.name}", timeout_s=timeout_s, qos=Qos.STATE)
     return list(messages_of(answers))
+
+
+def ask_status_briefly(bus: Bus, fleet: str) -> list[Any]:
+    """Return the statuses as `ask_status` does, but do without them if no supervisor answers soon."""
+    return ask_status(bus, fleet, BRIEF_TIMEOUT_S)
 
 
 def fleets_on(bus: Bus) -> dict[str, set[str]]:
@@ -35,14 +40,9 @@ def fleets_on(bus: Bus) -> dict[str, set[str]]:
     return found
 
 
-def ask_cars(bus: Bus, fleet: str) -> list[Any]:
-    """Return the statuses as `ask_status` does, but wait only shortly. They have the colors and groups of the cars."""
-    return ask_status(bus, fleet, COLORS_TIMEOUT_S)
-
-
 def ask_colors(bus: Bus, fleet: str) -> dict[str, Rgb]:
     """Return the colors of the cars of a running fleet. Empty if no supervisor answers."""
-    return {car: color for status in ask_cars(bus, fleet) for car, color in colors_of(status).items()}
+    return {car: color for status in ask_status_briefly(bus, fleet) for car, color in colors_of(status).items()}
 
 
 def gateways_of(status: Any) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import click
 
 from fleet.client.client import Fleet
 from fleet.client.outcome import NO_ANSWER, Outcome
-from fleet.client.supervision import ask_cars, fleets_on, gateways_of
+from fleet.client.supervision import ask_status_briefly, fleets_on, gateways_of
 from fleet.commands.car_names import ALL_CARS
 from fleet.commands.command_group import choose_fleet, chosen_person, is_named, name_fleet_in_hints
 from schemas.bus import Bus
@@ -132,7 +132,7 @@ def stop_in_all_fleets(client: Fleet, connect: str | None, act: Callable[[Fleet]
     answered = {each.car for _, each in both if each.phase != NO_ANSWER}
     silent = {fleet for fleet, each in both if each.phase == NO_ANSWER and each.car in answered}
     for fleet in silent:  # the supervisor knows the cars whose gateways hang or have ended
-        members.setdefault(fleet, set()).update(*map(gateways_of, ask_cars(client.bus, fleet)))
+        members.setdefault(fleet, set()).update(*map(gateways_of, ask_status_briefly(client.bus, fleet)))
     return [
         each if fleet == client.name else replace(each, car=f"{fleet}/{each.car}")
         for fleet, each in both

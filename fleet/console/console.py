@@ -21,7 +21,7 @@ from fleet.client.client import default_sender
 from fleet.client.command_tracker import PendingCommand
 from fleet.client.commands import CommandRequest, estop_request, pause_request, plain_request, stop_request
 from fleet.client.lease import LEASE_RENEWAL_INTERVAL_S
-from fleet.client.supervision import SUPERVISOR_STATUS, ask_cars, colors_of, groups_of
+from fleet.client.supervision import SUPERVISOR_STATUS, ask_status_briefly, colors_of, groups_of
 from fleet.console.budgets import MAX_OPEN_COMMANDS, Budgets, StopMerge
 from fleet.console.bus_message import is_shown, message_in
 from fleet.console.car_view import MAX_OTHER_CARS, FleetView
@@ -162,7 +162,7 @@ class Console:
         """Serve the pages until the task is cancelled."""
         bus, name = self._fleet.sync.bus, self._fleet.sync.name
         # Do this before any message comes, because a car keeps its first color.
-        for status in await self._fleet.call(ask_cars, bus, name):
+        for status in await self._fleet.call(ask_status_briefly, bus, name):
             self._take_fleet(status)
         for family in ("sensor", "state"):
             bus.subscribe(f"{name}/*/{family}/*", self._on_reading)

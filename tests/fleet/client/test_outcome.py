@@ -222,9 +222,9 @@ def test_reason_of_waiting_is_known_until_frame_is_sent() -> None:
     progress.on_event("asked", "", "", 0.0, 100.1)
     progress.on_event("queued", "", "opens in 3.6 s at most", 0.0, 100.1)
     progress.on_answer("queued", "", "", 0.0, 100.2)
-    assert progress.waits == "opens in 3.6 s at most"
+    assert progress.why_waiting == "opens in 3.6 s at most"
     progress.on_event("sent", "", "", 0.0, 103.0)
-    assert progress.waits == ""
+    assert progress.why_waiting == ""
 
 
 def test_waiting_command_is_explained_once(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:

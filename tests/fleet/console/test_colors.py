@@ -25,7 +25,7 @@ KEY = "fleet/@supervisor/status"
 async def test_car_keeps_fleet_color_after_early_event_and_reload(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervision, "COLORS_TIMEOUT_S", PATIENCE_S)
+    monkeypatch.setattr(supervision, "BRIEF_TIMEOUT_S", PATIENCE_S)
     hub = FleetProcesses(free_endpoint(), tmp_path)
     asked: list[zenoh.Query] = []
     hub.bus.queryable(KEY, asked.append)
