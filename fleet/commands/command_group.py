@@ -80,10 +80,10 @@ def fleet_option(default: str | None = DEFAULT_FLEET) -> _Decorator:
     return click.option("--fleet", metavar="NAME", default=default, show_default=True, callback=_from_group, help=words)
 
 
-def choose_fleet(connect: str | None, fleet: str) -> None:
+def remember_fleet(connect: str | None, fleet: str) -> None:
     """Remember with which options the user reaches the fleet. Commands that messages propose get the same options."""
     click.get_current_context().meta[_BUS] = connect, fleet
-    if is_named():
+    if is_fleet_named():
         name_fleet_in_hints()
 
 
@@ -92,7 +92,7 @@ def name_fleet_in_hints() -> None:
     click.get_current_context().meta[_NAMED] = True
 
 
-def is_named() -> bool:
+def is_fleet_named() -> bool:
     """Return True if the user has named the fleet of the running command."""
     at: click.Context | None = click.get_current_context()
     while at is not None:

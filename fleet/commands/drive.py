@@ -35,8 +35,9 @@ from schemas.words import Mode, Motion, Scope
 HANG_S: Final = 1.0
 """A bus that takes longer than this to answer a client hangs, and may come back."""
 REJOIN_S: Final = 3.0
+"""Time within which gateways come back to a bus that hung: they try twice a second."""
 REJOIN_POLL_S: Final = 0.05
-"""Time within which gateways come back to a bus that hung: they try twice a second. How often we look for them."""
+"""Interval at which we look for these gateways."""
 _MOTIONS: Final = tuple(each for each in Motion if each is not Motion.STOP)
 
 
@@ -137,9 +138,10 @@ def estop(cars: tuple[str, ...], why: str, connect: str | None, fleet: str, *, a
 
 
 def _client_that_stops(connect: str | None, fleet: str) -> tuple[Fleet, bool]:
-    """Return the client, and True if the hub hung before. If it fails, say first that nothing was stopped.
+    """Return an open client, and True if the hub hung at first.
 
-    A hub that hangs has as long as a stop whose bus is lost.
+    If the hub hangs, try again for as long as a stop would be sent again after a loss of the bus. Each error begins
+    with the consequence: nothing was stopped.
     """
     first_at = time.monotonic()
     while True:
@@ -168,7 +170,7 @@ def _stop(
     """Stop the cars in all fleets, unless the user named one. `request_for` makes the request for the named cars.
 
     After Ctrl-C, `lasts` says what stays in force.
-    A word that names no car fails, and the other cars are stopped all the same.
+    A word that names no car fails, and the cars of the other words are stopped all the same.
     """
     words = tuple(each for each in cars if keys.is_name(each.removeprefix("@")))
     wrong = [_not_stopped(each, f"use {keys.NAME_RULE}") for each in cars if each not in words]
@@ -194,7 +196,11 @@ def _stop(
 
 
 def _ask_returning(client: Fleet, request: CommandRequest, named: Sequence[str] | None) -> list[Outcome]:
-    """Ask each of these cars, or all, when its gateway is on the bus again, which has just come back."""
+    """Ask each of these cars, or all, as soon as its gateway has come back to the bus.
+
+    The hub hung until now, so gateways join it one after the other. A query to all cars would miss those that come
+    after it.
+    """
     pending, asked = [], set[str]()
     until = time.monotonic() + REJOIN_S
     while time.monotonic() < until:
@@ -207,6 +213,14 @@ def _ask_returning(client: Fleet, request: CommandRequest, named: Sequence[str] 
     if missing := [each for each in named or () if each not in asked]:  # their outcomes say that they are not there
         pending.append(client.send(request, missing))
     return [each for command in pending for each in client.outcomes(command)] if pending else client.ask(request)
+
+
+def _ask_missing_cars(client: Fleet, request: CommandRequest, cars: tuple[str, ...]) -> list[Outcome]:
+    """Send the request to cars that are named beside `all` but are not connected. A mistyped name then fails."""
+    named = [each for each in cars if each != ALL_CARS and not each.startswith("@")] if ALL_CARS in cars else []
+    connected = client.cars() if named else ()
+    missing = [each for each in named if each not in connected]
+    return client.ask(request, missing) if missing else []
 
 
 def _cars_to_stop(client: Fleet, words: Sequence[str]) -> tuple[list[str], list[Outcome]]:
@@ -304,11 +318,3 @@ def _complete_id(car: str, prefix: str, in_force: list[str]) -> str:
 def _named(client: Fleet, cars: tuple[str, ...]) -> list[str] | None:
     """Return the cars, or None for all. With None, one query reaches all cars, also those that joined just now."""
     return resolve_cars(client, cars) if cars and ALL_CARS not in cars else None
-
-
-def _ask_missing_cars(client: Fleet, request: CommandRequest, cars: tuple[str, ...]) -> list[Outcome]:
-    """Send the request to cars that are named beside `all` but are not connected. A mistyped name then fails."""
-    named = [each for each in cars if each != ALL_CARS and not each.startswith("@")] if ALL_CARS in cars else []
-    connected = client.cars() if named else ()
-    missing = [each for each in named if each not in connected]
-    return client.ask(request, missing) if missing else []

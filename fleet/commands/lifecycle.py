@@ -19,7 +19,7 @@ from fleet.commands.command_group import chosen_person, say
 from fleet.commands.exit_code import not_running
 from fleet.commands.observe import show_cars
 from fleet.commands.options import bus_options, json_option
-from fleet.commands.which_fleet import client_in, the_fleet
+from fleet.commands.which_fleet import client_in, find_fleet
 from fleet.supervisor.log_files import parse_log_line, runs_directory
 from fleet.supervisor.supervisor_service import ask_service
 from schemas import keys, messages
@@ -48,7 +48,7 @@ def status(connect: str | None, fleet: str, *, processes: bool, as_json: bool) -
     """Show the fleet and its session, then the cars, then which cars and services are not ready, and why."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        fleet = the_fleet(bus, fleet)
+        fleet = find_fleet(bus, fleet)
         found = ask_status(bus, fleet)
         if not found:
             raise not_running(fleet, connect)
@@ -106,7 +106,7 @@ def down(connect: str | None, fleet: str, *, as_json: bool) -> None:
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
         received: list[Any] = []
-        fleet = the_fleet(bus, fleet)
+        fleet = find_fleet(bus, fleet)
         bus.subscribe(f"{fleet}/{SUPERVISOR_STATUS.name}", lambda sample: received.extend(messages_of([sample])))
         sender = certified_sender(bus.identity, person=chosen_person())
         if not ask_status(bus, fleet) or (answer := ask_service(bus, fleet, "down", sender)) is None:
@@ -165,7 +165,7 @@ def reload(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Read the fleet file again, and apply changes of cars and plan. Print which changes need a restart."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        fleet = the_fleet(bus, fleet)
+        fleet = find_fleet(bus, fleet)
         answer = ask_service(bus, fleet, "reload", certified_sender(bus.identity, person=chosen_person()))
         if answer is None:
             raise not_running(fleet, connect)
@@ -220,7 +220,7 @@ def _log_directory(connect: str | None, fleet: str) -> Path:
     """Return the log directory of the running fleet if it is on this machine, else of the last run."""
     try:
         with Bus.open(connect) as bus:
-            fleet = the_fleet(bus, fleet)
+            fleet = find_fleet(bus, fleet)
             for each in ask_status(bus, fleet):
                 if Path(each.directory).is_dir():
                     return Path(each.directory)

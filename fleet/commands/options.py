@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from fleet.commands.car_names import complete_people
-from fleet.commands.command_group import as_option, choose_fleet, connect_option, fleet_option
+from fleet.commands.command_group import as_option, connect_option, fleet_option, remember_fleet
 from fleet.commands.exit_code import cli_errors
 from fleet.commands.params import Number
 from fleet.commands.which_fleet import open_client
@@ -34,7 +34,7 @@ def bus_options(function: _Function) -> _Function:
     @as_option(complete_people)
     @functools.wraps(function)
     def command(*args: Any, **options: Any) -> Any:
-        choose_fleet(options["connect"], options["fleet"])
+        remember_fleet(options["connect"], options["fleet"])
         with cli_errors():
             return function(*args, **options)
 

@@ -21,7 +21,7 @@ from fleet.commands.command_group import (
 from fleet.commands.options import bus_options, json_option
 from fleet.commands.output import echo_safely
 from fleet.commands.params import Choice, Duration
-from fleet.commands.which_fleet import the_fleet
+from fleet.commands.which_fleet import find_fleet
 from fleet.quota import Quota, parse_size
 from fleet.recording.session_lookup import DEFAULT_SESSIONS
 from fleet.recording.writing.disk_space import Reserve
@@ -280,7 +280,7 @@ def _connect_and_ask(verb: str, connect: str | None, fleet: str, **fields: str) 
     """Connect to the bus, then do as `_ask`."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        return _ask(bus, the_fleet(bus, fleet), verb, **fields)
+        return _ask(bus, find_fleet(bus, fleet), verb, **fields)
 
 
 def _ask(bus: Bus, fleet: str, verb: str, **fields: str) -> Any:
@@ -347,7 +347,7 @@ def status(connect: str | None, fleet: str, *, as_json: bool) -> None:
     """Show the recording of each site: its directory, how much was lost, and whether there is room."""
     keys.check_name(fleet, "fleet name")
     with Bus.open(connect) as bus:
-        fleet = the_fleet(bus, fleet)
+        fleet = find_fleet(bus, fleet)
         first = _ask(bus, fleet, RecorderVerb.STATUS)
         _show_status(first, as_json=as_json)
         for site, found in site_recordings(bus, fleet):

@@ -17,7 +17,7 @@ import click
 from msgspec.structs import replace
 
 from fleet.client.hints import complete_hints
-from fleet.commands.command_group import choose_fleet, connect_option, fleet_option
+from fleet.commands.command_group import connect_option, fleet_option, remember_fleet
 from fleet.commands.exit_code import cli_errors
 from fleet.commands.params import Number
 from fleet.coordinator.observer import listed_cars
@@ -128,7 +128,7 @@ def up(
         if fleet is not None:
             keys.check_name(fleet, "fleet name")
         spec = read(file, options)
-        choose_fleet(spec.endpoint if resolve_endpoint(spec.endpoint) != resolve_endpoint() else None, spec.fleet)
+        remember_fleet(spec.endpoint if resolve_endpoint(spec.endpoint) != resolve_endpoint() else None, spec.fleet)
         for warning in spec.warnings:
             click.echo(f"fleet: {warning}", err=True)
         if not spec.cars:
