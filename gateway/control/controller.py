@@ -176,10 +176,12 @@ class Controller(Generic[D_co]):
             self._log.record(pending, Phase.ASKED, now)
         if isinstance(what, Stop | EmergencyStop):
             return self._stop(pending, now)
-        # Track the drives of a stream even if they are refused. Otherwise a stream that goes on after a stop would
+        # Record the drives of a stream even if they are refused. Otherwise a stream that goes on after a stop would
         # drive the car as soon as somebody else's lease ends.
-        halted = isinstance(what, Drive) and not self._may_drive(command, what, now)
-        refusal = refusals.refuse(command, self._context(now, self.driver.refusal(what), is_halted=halted))
+        is_halted = isinstance(what, Drive) and not self._senders.on_drive(
+            command.sender.name, now, streamed=command.streamed, release=what.motion is Motion.STOP
+        )
+        refusal = refusals.refuse(command, self._context(now, self.driver.refusal(what), is_halted=is_halted))
         if refusal is not None:  # a refused command changes neither the lease nor the hold
             return self._reject(pending, *refusal, now)
         if isinstance(what, Pause):
@@ -291,7 +293,9 @@ class Controller(Generic[D_co]):
             self.safety.put_on_hold(sender.name, command.asked_ns, sender.kind)
         self.driver.halt(f"{command.verb} by {sender.text_name}", now, by=sender.name)
         if not self.driver.model.link_open or self.driver.shutting_down:
-            words = self._not_stopped("emergency-stopped" if isinstance(command.what, EmergencyStop) else "stopped")
+            words = self._describe_unstopped(
+                "emergency-stopped" if isinstance(command.what, EmergencyStop) else "stopped"
+            )
             words = f"{words} ({command.note})" if command.note else words
             return self._reject(pending, Reason.LINK_DOWN, words, now)
         if not self.driver.model.is_heard:
@@ -303,7 +307,7 @@ class Controller(Generic[D_co]):
         self.driver.stop(FrameOrigin.STOP, now, pending)
         return Answer(Phase.QUEUED, words=note, worst_case_s=worst)
 
-    def _not_stopped(self, later: str) -> str:
+    def _describe_unstopped(self, later: str) -> str:
         """Describe what it means for the car that a stop cannot be sent, and what will happen to the car later."""
         car, ending = self.car, self.driver.shutting_down
         if self.driver.model.link_open:
@@ -312,10 +316,6 @@ class Controller(Generic[D_co]):
         return (
             f"NOT STOPPED: {car} is unreachable. If it was driving, it still is: go to the car. It is {later} {when}."
         )
-
-    def _may_drive(self, command: Command, drive: Drive, now: float) -> bool:
-        release = drive.motion is Motion.STOP
-        return self._senders.may_drive(command.sender.name, now, streamed=command.streamed, release=release)
 
     def _resume(self, pending: Pending, resume: Resume, now: float) -> Answer:
         """End e-stops, the hold, or both, if the sender may end them. The answer says which of them stay."""
@@ -454,20 +454,21 @@ class Controller(Generic[D_co]):
         return max(self.driver.free_at(now) - now, 0.0)
 
     def _drive(self, pending: Pending, drive: Drive, now: float) -> Answer:
+        """Hold a motion. If its sender holds it already, only its end changes."""
         sender, held = pending.command.sender, self._queue.held
         if held is not None and held.motion is drive.motion and held.sender == sender:
             return self._prolong_drive(held, pending, drive.duration_s, now)
         words = f"{drive.motion} by {sender.text_name}"
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
-        self._queue.held = HeldMotion(drive.motion, pending, *self._times(pending, drive.duration_s, now))
+        self._queue.held = HeldMotion(drive.motion, pending, *self._drive_times(pending, drive.duration_s, now))
         if held is not None and held.motion is drive.motion and held.pending.sent:
             self._queue.held.begin(now, self.driver.model.range_cm)
             self._log.record_sent(pending, now, "the running drive was extended")
             return Answer(Phase.SENT, words="the running drive was extended")
         self.driver.resume_motion(words, now)
-        return self._queued(pending, now, self._wait(pending, now))
+        return self._queued(pending, now, self._describe_wait(pending, now))
 
-    def _times(self, pending: Pending, duration_s: float, now: float) -> tuple[float, float]:
+    def _drive_times(self, pending: Pending, duration_s: float, now: float) -> tuple[float, float]:
         """Return when a drive expires if its frame is not written, and how long it lasts once the frame is written.
 
         For a sample of a stream, the duration counts from now, and the second value is 0.
@@ -477,7 +478,7 @@ class Controller(Generic[D_co]):
         wait_s = max(self.wait_s(pending.command.what, now), duration_s) + START_MARGIN_S
         return now + min(wait_s, MAX_QUEUE_TIME_S), duration_s
 
-    def _wait(self, pending: Pending, now: float) -> str:
+    def _describe_wait(self, pending: Pending, now: float) -> str:
         """Describe how long a drive or a mode waits for its frame. Empty for a stream, or if it need not wait."""
         command = pending.command
         if command.streamed or (wait_s := self.wait_s(command.what, now)) < LATE_DRIVE_S:
@@ -496,7 +497,7 @@ class Controller(Generic[D_co]):
         if held.pending.sent:
             held.expires_at = now + duration_s
         else:
-            held.expires_at, held.duration_s = self._times(pending, duration_s, now)
+            held.expires_at, held.duration_s = self._drive_times(pending, duration_s, now)
         held.pending.count += 1
         if pending.command.streamed and (held.pending.command.streamed or not held.pending.sent):
             return Answer(Phase.SENT if held.pending.sent else Phase.QUEUED)
@@ -511,7 +512,7 @@ class Controller(Generic[D_co]):
         )
         pending.count = held.pending.count
         held.pending = pending
-        return self._queued(pending, now, self._wait(pending, now))
+        return self._queued(pending, now, self._describe_wait(pending, now))
 
     def _pass_drive_on(self, held: HeldMotion, pending: Pending, changed: str, now: float) -> Answer:
         """Let a command take over the drive of which it has changed the end. Whoever waits for the older one is told.
@@ -527,6 +528,7 @@ class Controller(Generic[D_co]):
         return Answer(Phase.SENT, words=words)
 
     def _release(self, pending: Pending, now: float) -> Answer:
+        """End whatever moves the car, for a drive with motion stop. Unlike `_stop`, this leaves no hold."""
         sender = pending.command.sender.text_name
         self.driver.end_drive(f"released by {sender}", now)
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, f"released by {sender}", now)
@@ -539,6 +541,7 @@ class Controller(Generic[D_co]):
         return Answer(Phase.QUEUED, worst_case_s=worst)
 
     def _close_mode(self, pending: Pending, now: float) -> Answer:
+        """Close whatever mode is open, by a full stop. The command is sent with the first frame of the stop."""
         by = pending.command.sender.text_name
         self._queue.drop(Phase.SUPERSEDED, Reason.SUPERSEDED, f"mode manual by {by}", now)
         answer = self._queued(pending, now)
@@ -546,6 +549,7 @@ class Controller(Generic[D_co]):
         return answer
 
     def _set_mode(self, pending: Pending, mode: Mode, now: float) -> Answer:
+        """Queue the opening of a mode, unless the car is in it. The driver first stops a car that moves."""
         words = f"mode {mode} by {pending.command.sender.text_name}"
         self._queue.close_mode_change(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
         self._queue.close_held(Phase.SUPERSEDED, Reason.SUPERSEDED, words, now)
@@ -553,7 +557,7 @@ class Controller(Generic[D_co]):
         settled = model.known and not self.driver.is_stopping and model.mode.verdict is not Verdict.CONTRADICTED
         if settled and self.driver.model.mode.asked is mode:
             return self._done(pending, f"{self.car} is in mode {mode} already ({self.driver.model.mode.verdict})", now)
-        wait = self._wait(pending, now)
+        wait = self._describe_wait(pending, now)
         self._queue.mode_change = pending
         return self._queued(pending, now, wait)
 
@@ -566,11 +570,12 @@ class Controller(Generic[D_co]):
         return Answer(Phase.SENT, reason, words)
 
     def _queued(self, pending: Pending, now: float, wait: str = "") -> Answer:
-        words = wait if self.driver.model.is_heard else "; ".join(filter(None, (wait, self._silent(now))))
+        """Answer a command that waits for the car. `wait` says how long, if it is worth a word."""
+        words = wait if self.driver.model.is_heard else "; ".join(filter(None, (wait, self._describe_silence(now))))
         self._log.record(pending, Phase.QUEUED, now, words=words)
         return Answer(Phase.QUEUED, words=words)
 
-    def _silent(self, now: float) -> str:
+    def _describe_silence(self, now: float) -> str:
         silent_s = self.driver.model.silent_s(now)
         return f"{self.car} has been silent for {silent_s:.0f} s: nothing shows that it hears this"
 

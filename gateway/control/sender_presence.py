@@ -23,6 +23,7 @@ class Senders(Struct):
     _drives: dict[str, tuple[float, bool]] = field(default_factory=dict)
     """When the last drive of each sender arrived, and True if it was a sample of a stream."""
     _halted: set[str] = field(default_factory=set)
+    """The senders whose drives are refused until they have sent none for `STREAM_SILENCE_S`."""
 
     # ------------------------------------------------------------------ tokens
 
@@ -53,8 +54,8 @@ class Senders(Struct):
 
     # ------------------------------------------------------------------ drive streams
 
-    def may_drive(self, name: str, now: float, *, streamed: bool, release: bool) -> bool:
-        """Record a drive. Return False if the car was stopped, and the sender has not been silent since then."""
+    def on_drive(self, name: str, now: float, *, streamed: bool, release: bool) -> bool:
+        """Record a drive, or with `release` its end. Return False if the sender must send none for a while first."""
         last, _ = self._drives.pop(name, (float("-inf"), False))
         if release or now - last >= STREAM_SILENCE_S:
             self._halted.discard(name)
@@ -65,19 +66,6 @@ class Senders(Struct):
             self._halted.discard(oldest)
         return name not in self._halted
 
-    def halt_streams(self, now: float) -> None:
-        """Refuse each stream until it was silent.
-
-        So a joystick that was held before the car was lost cannot drive the car when it is back.
-        """
-        self._halted.update(
-            name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_SILENCE_S
-        )
-
-    def skip(self, slept_s: float) -> None:
-        """Do not count a sleep of the computer as silence of a stream, if the clock runs on during the sleep."""
-        self._drives = {name: (last + slept_s, streamed) for name, (last, streamed) in self._drives.items()}
-
     def halt(self, now: float, by: str = "") -> None:
         """Refuse each sender that has just driven, until it has been silent, because the car was stopped."""
         # The sender of the stop is exempt, unless it streams: a script may stop and drive again, a held joystick may
@@ -87,3 +75,17 @@ class Senders(Struct):
             for name, (last, streamed) in self._drives.items()
             if now - last < STREAM_SILENCE_S and (streamed or name != by)
         )
+
+    def halt_streams(self, now: float) -> None:
+        """Refuse each stream until it has been silent, because the car was lost.
+
+        Otherwise a joystick that was held before the car was lost would drive the car when it is back. A script sends
+        a drive once, and that drive has ended with the link.
+        """
+        self._halted.update(
+            name for name, (last, streamed) in self._drives.items() if streamed and now - last < STREAM_SILENCE_S
+        )
+
+    def skip(self, slept_s: float) -> None:
+        """Do not count a sleep of the computer as silence of a stream, if the clock runs on during the sleep."""
+        self._drives = {name: (last + slept_s, streamed) for name, (last, streamed) in self._drives.items()}
