@@ -62,8 +62,8 @@ class CarPublisher:
         self._histories: dict[str, HistoryBuffer] = {}
         self._published_states: dict[str, tuple[object, ...]] = {}
         self._published_at: dict[str, float] = {}
-        self._shown: tuple[object, ...] = ()
-        """`_shown_state` when the states were last published."""
+        self._claims: tuple[object, ...] = ()
+        """`_claims_of` the car when the states were last published."""
         self._findings: tuple[object, ...] = ()
         """`_findings_of` the car when its health was last published."""
         for topic in topics.CAR_TOPICS:
@@ -209,7 +209,7 @@ class CarPublisher:
     @property
     def is_outdated(self) -> bool:
         """True if a reading or a silence has changed a state since the last `publish_states`."""
-        return _shown_state(self._driver.model) != self._shown
+        return _claims_of(self._driver.model) != self._claims
 
     @property
     def has_new_findings(self) -> bool:
@@ -222,7 +222,7 @@ class CarPublisher:
         """Publish each state that changed, and all of them once a second."""
         model, safety = control.driver.model, control.safety
         mode = model.mode
-        self._shown = _shown_state(model)
+        self._claims = _claims_of(model)
         lease = safety.lease_at(now)
         changes: dict[str, tuple[object, ...]] = {
             "state/link": (health.state, health.reconnects, health.state is LinkState.LOST and health.reason),
@@ -365,8 +365,8 @@ def _findings_of(model: DriverClaims) -> tuple[object, ...]:
     return model.profile.name, model.shows, model.doubted
 
 
-def _shown_state(model: DriverClaims) -> tuple[object, ...]:
-    """Return the part of the published states that readings or silence may change."""
+def _claims_of(model: DriverClaims) -> tuple[object, ...]:
+    """Return the claims in the published states that a reading or a silence may change."""
     return model.mode.verdict, model.mode.inferred, model.motors, model.basis, *_findings_of(model)
 
 

@@ -126,7 +126,7 @@ async def _listen(link: Link, lines: "MonitorOutput", writer: capture.CaptureWri
             # Round as in the file, so that the file is decoded in the same way.
             now = round(time.monotonic() - origin, 6)
             if not done:
-                lines.tick(now)
+                lines.flush(now)
                 continue
             piece = capture.CapturedBytes(now, reading.result())
             reading = asyncio.ensure_future(link.read())
@@ -164,12 +164,12 @@ class MonitorOutput:
         self.statistics.until = piece.at
         self._print(self._decoder.feed(piece.data, piece.at))
 
-    def tick(self, now: float) -> None:
+    def flush(self, now: float) -> None:
         """Print the events that silence completes."""
-        self._print(self._decoder.tick(now))
+        self._print(self._decoder.flush(now))
 
     def deadline(self) -> float | None:
-        """Return the time at which to call `tick`."""
+        """Return the time at which to call `flush`."""
         return self._decoder.deadline()
 
     def end(self, at: float | None = None) -> None:

@@ -55,7 +55,7 @@ class LinkProbe(Struct):
                 async with asyncio.timeout(wait_s):
                     data = await self.link.read()
             except TimeoutError:
-                self._count(self._decoder.tick(time.monotonic()))
+                self._count(self._decoder.flush(time.monotonic()))
             except LinkError as error:
                 self.trouble = str(error)
                 break
@@ -74,7 +74,7 @@ class LinkProbe(Struct):
             if self.trouble is not None:
                 return
             data, last = encode(step.frame), time.monotonic()
-            self._decoder.sent(data, last)
+            self._decoder.sends(data, last)
             try:
                 await self.link.write(data)
             except LinkError as error:

@@ -233,7 +233,7 @@ class Wild:
 
     def _pass(self, gap_s: float) -> None:
         self.now += gap_s
-        for event in self.decoder.tick(self.now):
+        for event in self.decoder.flush(self.now):
             self.control.driver.on_event(event, self.now)
         self.control.tick(self.now)
 
@@ -269,7 +269,7 @@ class Wild:
                 self.linked = False
             else:
                 self.control.driver.on_written(write, self.now)
-                self.decoder.sent(write.data, self.now)
+                self.decoder.sends(write.data, self.now)
                 self.free_at = self.now + self.control.driver.model.profile.block_s(write.frame)
             assert self.control.driver.poll(self.now) is None, "one frame in flight"
         self.control.take_records()

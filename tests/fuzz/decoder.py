@@ -38,8 +38,8 @@ def run(seed: int, pieces: int) -> int:
         try:
             now += moments.choice((0.0, 0.0, 0.001, 0.02, 0.049, 0.051, 3.0, 1e6 if number % 5000 == 0 else 0.5))
             if moments.random() < 0.05:
-                decoder.sent(moments.choice((b"$4WD,MODE00#", b"#", READINGS[3])), now)
-            events = decoder.tick(now) if moments.random() < 0.3 else []
+                decoder.sends(moments.choice((b"$4WD,MODE00#", b"#", READINGS[3])), now)
+            events = decoder.flush(now) if moments.random() < 0.3 else []
             events += decoder.feed(piece(moments), now)
             for event in events:
                 assert 0 < len(event.raw) <= 256
@@ -49,7 +49,7 @@ def run(seed: int, pieces: int) -> int:
             assert len(decoder._sent) <= 256
             if number % FRESH == FRESH - 1:
                 # Whatever the decoder has buffered, the second good frame after a silence decodes.
-                decoder.sent(b"#", now - 10.0)
+                decoder.sends(b"#", now - 10.0)
                 event = decoder.feed(b"#\r\n" + MANUAL + MANUAL, now + 10.0)[-1]
                 assert isinstance(event, Sensors)
                 assert event.raw == MANUAL

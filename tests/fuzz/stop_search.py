@@ -702,7 +702,7 @@ class Episode:
         self.now = max(self.now + 1e-4, min(wake, end))
         self._carry(zero)
         if self._linked:
-            for event in self.decoder.tick(self.now):
+            for event in self.decoder.flush(self.now):
                 self.control.driver.on_event(event, self.now)
             if self.now >= self._next_tick:
                 self._next_tick = self.now + TICK_S
@@ -766,7 +766,7 @@ class Episode:
             else:
                 self.car.feed(write.data, max(now, self.car.now))
             control.driver.on_written(write, now)
-            self.decoder.sent(write.data, now)
+            self.decoder.sends(write.data, now)
         else:
             raise AssertionError("control writes without end")
         for record in control.take_records():

@@ -193,7 +193,7 @@ class Pair:
                     self.control.driver.on_event(event, self.now)
                     self.decoder.use_head(self.control.driver.model.profile.dialect.head)
         if linked:
-            for event in self.decoder.tick(self.now):
+            for event in self.decoder.flush(self.now):
                 self._touched = True
                 self.control.driver.on_event(event, self.now)
             self.tick()
@@ -216,7 +216,7 @@ class Pair:
             self.sent.append((self.now, write.data))
             self.car.feed(write.data, self.now)
             self.control.driver.on_written(write, self.now)
-            self.decoder.sent(write.data, self.now)
+            self.decoder.sends(write.data, self.now)
         self._take()
 
     def _take(self) -> None:

@@ -125,7 +125,7 @@ class Redecoding(Struct):
             self._decoder, self._head = FrameSplitter(head=head), head
         while self._sent and self._sent[0].at_ns <= frame.at_ns + _MAX_ECHO_LEAD_NS:
             sent = self._sent.popleft()
-            self._decoder.sent(sent.data, (sent.at_ns - self._began_ns) / 1e9)
+            self._decoder.sends(sent.data, (sent.at_ns - self._began_ns) / 1e9)
         modes = [each.mode for each in _around(self._modes, frame.at_ns, MAX_MODE_DELAY_NS)] or [None]
         found: list[Outcome] = []
         decoded = _decode(self._decoder, frame.data, at)

@@ -68,7 +68,7 @@ class YahboomDriver(Executor):
 
     def flush(self, now: float) -> list[Event]:
         """Return the events whose frame was ended by a silence."""
-        return [*self._decoder.tick(now)]
+        return [*self._decoder.flush(now)]
 
     def flush_at(self) -> float:
         """Return when `flush` has something to do if no byte arrives earlier, or inf if never."""
@@ -81,7 +81,7 @@ class YahboomDriver(Executor):
 
     def sends(self, data: bytes, now: float) -> None:
         """Remember the bytes of a frame that is about to be written, because the link may echo them."""
-        self._decoder.sent(data, now)
+        self._decoder.sends(data, now)
 
     def measured(self, event: Event) -> Mapping[str, Fields]:
         """Return the measured values of an event by topic."""

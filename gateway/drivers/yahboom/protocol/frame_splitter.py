@@ -67,7 +67,7 @@ class FrameSplitter:
 
     def feed(self, data: bytes, now: float) -> list[Event]:
         """Return the events that these bytes complete. `now` is their time of arrival in seconds, any fixed origin."""
-        events = self.tick(now) if self._buffer else []
+        events = self.flush(now) if self._buffer else []
         buffer, sent, pos, size, most = self._buffer, self._sent, 0, len(data), self._max
         match_ended = self._match_ended
         while pos < size:
@@ -84,7 +84,7 @@ class FrameSplitter:
             self._silence_s = self._ending_silence_s() if buffer else inf
         return events
 
-    def tick(self, now: float) -> list[Event]:
+    def flush(self, now: float) -> list[Event]:
         """Return the events that the silence until `now` completes. `feed` calls this first."""
         if now < self._last_at + self._silence_s:
             return []
@@ -95,11 +95,11 @@ class FrameSplitter:
         return self._take_unended(by_silence=True)
 
     def deadline(self) -> float | None:
-        """Return the time at which to call `tick`, on the clock of `now`. None if a silence would complete no event."""
+        """Return when to call `flush`, on the clock of `now`. None if a silence would complete no event."""
         return self._last_at + self._silence_s if self._buffer else None
 
-    def sent(self, data: bytes, now: float) -> None:
-        """Remember a frame as written, to recognize its echo (the same bytes coming back) for 2 s."""
+    def sends(self, data: bytes, now: float) -> None:
+        """Remember a frame that is about to be written, to recognize its echo (the same bytes) for 2 s."""
         self._sent.pop(data, None)
         self._sent[data] = now
         while len(self._sent) > _SENT_MAX or now - next(iter(self._sent.values())) > ECHO_S:

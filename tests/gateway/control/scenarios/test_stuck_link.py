@@ -37,7 +37,7 @@ class Wire:
     def receive(self, *, linked: bool) -> None:
         self._receive(linked=linked and not self.stuck)
         if self.stuck:
-            self._pair.decoder.tick(self._pair.now)
+            self._pair.decoder.flush(self._pair.now)
             self._pair.tick()
 
     def free(self) -> None:

@@ -28,7 +28,7 @@ SETTLED_S = {mode: BLOCK_S + (0.1 if mode is Mode.MANUAL else 1.0) for mode in M
 
 def reading(shape: bytes, at: float) -> Sensors:
     decoder = FrameSplitter()
-    event = (decoder.feed(shape, at) + decoder.tick(at + MISSING_END_SILENCE_S))[0]
+    event = (decoder.feed(shape, at) + decoder.flush(at + MISSING_END_SILENCE_S))[0]
     assert isinstance(event, Sensors)
     return event
 

@@ -24,7 +24,7 @@ ARM = "$4WD,J190,J290,J390,J490,J590,J690#"
 
 def event_of(text: str) -> Event:
     decoder = FrameSplitter()
-    return (decoder.feed(wire(text), 1.0) + decoder.tick(1.0 + MISSING_END_SILENCE_S))[0]
+    return (decoder.feed(wire(text), 1.0) + decoder.flush(1.0 + MISSING_END_SILENCE_S))[0]
 
 
 def hear(truth: PlatformDetector, *frames: str) -> list[str]:

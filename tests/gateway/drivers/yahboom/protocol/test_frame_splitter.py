@@ -88,12 +88,12 @@ def test_missing_frame_end_is_accepted_after_50_ms_silence() -> None:
     decoder = FrameSplitter()
     assert decoder.feed(FOLLOWING, 1.0) == []
     assert decoder.deadline() == pytest.approx(1.05)
-    assert decoder.tick(1.049) == []
-    (event,) = decoder.tick(decoder.deadline() or 0.0)
+    assert decoder.flush(1.049) == []
+    (event,) = decoder.flush(decoder.deadline() or 0.0)
     assert isinstance(event, Sensors)
     assert (event.raw, event.at, event.terminated, event.by_silence) == (FOLLOWING, 1.0, False, True)
     assert decoder.deadline() is None
-    assert decoder.tick(9.0) == []
+    assert decoder.flush(9.0) == []
 
 
 def test_feed_sees_a_silence_that_no_tick_told_it_of() -> None:
@@ -108,7 +108,7 @@ def test_feed_sees_a_silence_that_no_tick_told_it_of() -> None:
 def test_late_frame_end_is_no_junk() -> None:
     decoder = FrameSplitter()
     decoder.feed(FOLLOWING, 1.0)
-    assert len(decoder.tick(1.06)) == 1
+    assert len(decoder.flush(1.06)) == 1
     (event,) = decoder.feed(b"#" + GOOD, 1.07)
     assert isinstance(event, Sensors)
     (junk,) = decoder.feed(b"#" + b"$", 2.0)
@@ -119,7 +119,7 @@ def test_late_frame_end_is_no_junk() -> None:
 def test_rest_of_frame_may_be_late(cut: int) -> None:
     decoder = FrameSplitter()
     decoder.feed(FOLLOWING[:cut], 1.0)
-    assert decoder.tick(1.49) == []
+    assert decoder.flush(1.49) == []
     (event,) = decoder.feed(FOLLOWING[cut:] + b"#", 1.49)
     assert isinstance(event, Sensors), "a radio repeats what it lost"
 
@@ -130,7 +130,7 @@ def test_silence_ends_an_incomplete_frame(cut: int, *, ticks: bool) -> None:
     decoder = FrameSplitter()
     decoder.feed(FOLLOWING[:cut], 1.0)
     assert decoder.deadline() == pytest.approx(1.5)
-    events = decoder.tick(1.5) if ticks else []
+    events = decoder.flush(1.5) if ticks else []
     events += decoder.feed(FOLLOWING[cut:] + b"#" + GOOD, 3.0)
     assert isinstance(events[-1], Sensors)
     assert [each.cause for each in events[:-1] if isinstance(each, Rejected)] == [Cause.TRUNCATED, Cause.NO_START]
@@ -141,9 +141,9 @@ def test_silence_ends_a_run_of_junk() -> None:
     assert decoder.feed(b"hel", 1.0) == []
     assert decoder.feed(b"lo\r\n", 1.02) == []
     assert decoder.deadline() == pytest.approx(1.07)
-    assert decoder.tick(1.07) == [TextLine(b"hello\r\n", 1.02)]
+    assert decoder.flush(1.07) == [TextLine(b"hello\r\n", 1.02)]
     decoder.feed(b"hello", 2.0)
-    assert decoder.tick(2.05) == [Rejected(b"hello", 2.0, Cause.NO_START, "5 bytes outside a frame")]
+    assert decoder.flush(2.05) == [Rejected(b"hello", 2.0, Cause.NO_START, "5 bytes outside a frame")]
 
 
 def test_separators_between_frames_make_no_event_and_want_no_tick() -> None:
@@ -214,35 +214,35 @@ class TestEcho:
 
     def test_our_own_frame_within_2_s_is_no_reading(self) -> None:
         decoder = FrameSplitter()
-        decoder.sent(self.SENT, 1.0)
+        decoder.sends(self.SENT, 1.0)
         assert decoder.feed(self.SENT, 3.0) == [Echo(self.SENT, 3.0)]
         assert isinstance(decoder.feed(self.SENT, 3.01)[0], ArmReading)
 
     def test_echo_in_pieces_and_repeated(self) -> None:
         decoder = FrameSplitter()
-        decoder.sent(self.SENT, 1.0)
+        decoder.sends(self.SENT, 1.0)
         events = [event for byte in self.SENT * 2 for event in decoder.feed(bytes([byte]), 1.5)]
         assert events == [Echo(self.SENT, 1.5)] * 2
 
     def test_sensors_frame_that_we_sent_is_an_echo_too(self) -> None:
         decoder = FrameSplitter()
-        decoder.sent(GOOD, 1.0)
+        decoder.sends(GOOD, 1.0)
         assert decoder.feed(GOOD, 1.1) == [Echo(GOOD, 1.1)]
         assert isinstance(decoder.feed(GOOD, 3.1)[0], Sensors)
 
     def test_lone_end(self) -> None:
         decoder = FrameSplitter()
-        decoder.sent(b"#", 1.0)
-        decoder.sent(b"$4WD,MODE00#", 1.05)
+        decoder.sends(b"#", 1.0)
+        decoder.sends(b"$4WD,MODE00#", 1.05)
         echoes = decoder.feed(b"#\r\n$4WD,MODE00#", 1.1)
         assert echoes == [Echo(b"#", 1.1), Echo(b"$4WD,MODE00#", 1.1)]
 
     def test_sent_frames_are_forgotten_after_a_while(self) -> None:
         decoder = FrameSplitter()
         for i in range(10_000):
-            decoder.sent(b"$4WD,PTZ%d#" % i, i * 0.001)
+            decoder.sends(b"$4WD,PTZ%d#" % i, i * 0.001)
         assert len(decoder._sent) <= 256
-        decoder.sent(b"#", 100.0)
+        decoder.sends(b"#", 100.0)
         assert list(decoder._sent) == [b"#"]
 
 

@@ -42,12 +42,12 @@ def timeless(events: list[Event]) -> list[Event]:
 def events_of(bursts: list[tuple[bytes, float]], size: int | None, *, ticks: bool) -> list[Event]:
     """Return all events of bursts in pieces of `size` bytes, with or without the requested ticks."""
     decoder, now, events = FrameSplitter(), 100.0, []
-    decoder.sent(b"$4WD,MODE00#", now)
-    decoder.sent(b"#", now)
+    decoder.sends(b"$4WD,MODE00#", now)
+    decoder.sends(b"#", now)
     for burst, silence in bursts:
         now += silence
         if ticks and (due := decoder.deadline()) is not None and due <= now:
-            events += decoder.tick(due)
+            events += decoder.flush(due)
             assert decoder.deadline() is None
         step = size or max(len(burst), 1)
         for start in range(0, len(burst), step):

@@ -32,7 +32,7 @@ ALL = "range battery grayscale line obstacle light"
 
 def sensors(raw: bytes, ended: str) -> Sensors:
     decoder = FrameSplitter()
-    event = (decoder.feed(raw + (b"$" if ended == "$" else b""), 1.0) + decoder.tick(2.0))[0]
+    event = (decoder.feed(raw + (b"$" if ended == "$" else b""), 1.0) + decoder.flush(2.0))[0]
     assert isinstance(event, Sensors)
     assert (event.terminated, event.by_silence) == (ended == "#", ended == "silence")
     return event
@@ -281,7 +281,7 @@ def test_readings_of_another_head_are_known_in_every_mode() -> None:
     decoder = FrameSplitter(head=profile.dialect.head)
     texts = (b"CSB57.24,PV7.91,GS214,LF1011,HW01,GM10", b"CSB0,PV8,GS0,LF0110,HW00,GM00")
     events = decoder.feed(b"".join(b"$BALA,%b#" % text for text in texts), 1.0)
-    events += decoder.feed(b"$BALA,CSB120,PV8.3,GS000,LF0000,HW10,GM00", 2.0) + decoder.tick(3.0)
+    events += decoder.feed(b"$BALA,CSB120,PV8.3,GS000,LF0000,HW10,GM00", 2.0) + decoder.flush(3.0)
     readings = [event for event in events if isinstance(event, Sensors)]
     modes = [(Mode.MANUAL,), (Mode.TRACKING,), (Mode.FOLLOWING,)]
     assert [candidate_modes(event) for event in readings] == modes
