@@ -94,8 +94,9 @@ class Bus:
         """Threads of Zenoh that run our callbacks."""
         self._alive: dict[str, set[str]] = {}
         """Existing tokens by watched expression."""
-        self._asked_over = ""
-        """Link over which an answer with tokens has come. Empty while tokens of a watch may still be on their way."""
+        self._answered_over = ""
+        """The link over which a question for tokens was answered before, so that the next answer over it is whole.
+        Empty while tokens of a watch may still be on their way."""
         self.endpoint = endpoint
         self.boot_id = os.urandom(16).hex()
         self._pid = os.getpid()
@@ -413,9 +414,9 @@ class Bus:
         wanted, end = zenoh.KeyExpr(expression), monotonic() + timeout_s
         link_end = min(end, monotonic() + LINK_TIMEOUT_S)
         while True:
-            asked_at, link, asked_over = monotonic(), self._link.address, self._asked_over
+            asked_at, link, answered_over = monotonic(), self._link.address, self._answered_over
             with self._lock:
-                if expression in self._alive and link in ("", asked_over):
+                if expression in self._alive and link in ("", answered_over):
                     return sorted(self._alive[expression])
                 is_watching = bool(self._alive)
                 watched = {
@@ -427,10 +428,10 @@ class Bus:
             with self.while_open():
                 replies = self._session.liveliness().get(expression, timeout=max(end - asked_at, _LINK_POLL_S))
             found = watched | {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
-            self._asked_over = link
+            self._answered_over = link
             now = monotonic()
             is_prompt = now - asked_at < _PROMPT_S
-            is_whole = is_prompt and link == self._link.address and (link == asked_over or not is_watching)
+            is_whole = is_prompt and link == self._link.address and (link == answered_over or not is_watching)
             if is_whole or now >= (end if link else link_end):
                 return sorted(found)
             if not is_prompt:
@@ -463,7 +464,7 @@ class Bus:
 
         self._declare(declare)
         if awaited and not complete.wait(_TOKEN_HISTORY_TIMEOUT_S):
-            self._asked_over = ""
+            self._answered_over = ""
         with self._lock:
             self._alive[expression] = alive
 

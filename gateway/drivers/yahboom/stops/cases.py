@@ -86,30 +86,36 @@ class StopCase(Struct, frozen=True, eq=False):
 
 
 def _ends_in_time(case: StopCase, facts: StopFacts) -> StopCase | None:
+    """End when the car has obeyed, if the frames arrived. No report could say more."""
     return case if facts.is_time_up else None
 
 
 def _ends_on_report(case: StopCase, facts: StopFacts) -> StopCase | None:
+    """End as `_ends_in_time`, but only after a report in this try, as a sign of life. The end of a drive needs none."""
     had_report = facts.reported_in_try or facts.is_soft
     return case if facts.is_time_up and had_report else _by_fan(facts)
 
 
 def _ends_on_probes(case: StopCase, facts: StopFacts) -> StopCase | None:
+    """End when the car has reported, but not reacted to the probes."""
     if facts.reported and facts.probes >= DOUBTED_PROBES:
         return case
     return _by_fan(facts) or _by_echo(facts)
 
 
 def _ends_in_mode_0(_: StopCase, facts: StopFacts) -> StopCase | None:
-    mute = NO_REACTION if facts.reported_in_try and not facts.can_show else None
-    return _by_fan(facts) or _by_echo(facts) or mute
+    """End only with another case: when something is found that keeps the car from showing its stop."""
+    unable = NO_REACTION if facts.reported_in_try and not facts.can_show else None
+    return _by_fan(facts) or _by_echo(facts) or unable
 
 
 def _by_fan(facts: StopFacts) -> StopCase | None:
+    """End if the fan may be what makes the car silent."""
     return FAN if facts.is_time_up and facts.fan_silences else None
 
 
 def _by_echo(facts: StopFacts) -> StopCase | None:
+    """End if the reports have no echo: their times depend on the ranging then, and show nothing."""
     if not facts.without_echo:
         return None
     return NO_ECHO if facts.can_show else NO_REACTION

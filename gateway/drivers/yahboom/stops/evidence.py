@@ -158,6 +158,8 @@ class StopEvidence(Struct):
     """Number of consecutive reports without an echo."""
     changed_expectation: bool = False
     """True if the last reading showed that this car cannot show a stop after all, or has another rhythm than before."""
+
+    # What arrived last.
     _last_at: float = _NEVER
     """When the last bytes arrived, except text, echoes, and frames of the options (arm, gyro)."""
     _foreign_at: float = _NEVER
@@ -166,28 +168,36 @@ class StopEvidence(Struct):
     """When the last report with an echo arrived. None if anything else has arrived since."""
     _no_echo_report_at: float | None = None
     """When the last report without an echo arrived. None if anything else has arrived since."""
+    _ended_with_echo: bool = False
+    """True if the last bytes were a report with an echo, also if it arrived too early to count."""
+
+    # What was written since the last report.
+    _blocks: list[_Block] = field(default_factory=list)
+    """The other frames that block, written since the last report."""
+    _other_frame_written: bool = False
+    """True if a frame other than `MODE00` was written since the last report."""
+
+    # The `MODE00` that waits for a result.
     _mode_00_at: float | None = None
     """When the last `MODE00` was written. None if it has a result, or will not be judged."""
     _first_delay_s: float | None = None
     """The delay of the first report after the `MODE00` that waits for a result. None if it is not known."""
-    _delayed: int = 0
-    """Number of this stop's `MODE00` frames whose first report had another delay than the block, or none."""
-    _block_gaps: int = 0
-    _gaps_needed: int = BLOCK_GAPS
     _unjudged: bool = False
     """True if a frame was written after the `MODE00` that the next block gap would judge."""
-    _controlled: bool = False
-    """True if the control of this stop was passed: the report after a frame that does not block came on time."""
-    _blocks: list[_Block] = field(default_factory=list)
-    """The other frames that block, written since the last report."""
-    _misfits: int = 0
-    """Number of intervals with a `MODE00` that were neither normal nor a block gap. Another program may be running."""
-    _ended_with_echo: bool = False
-    """True if the last bytes were a report with an echo, also if it arrived too early to count."""
-    _other_frame_written: bool = False
-    """True if a frame other than `MODE00` was written since the last report."""
     _older_reports_s: float = 0.0
     """Time after `MODE00` for which reports may arrive that the car sent before it. 0 until a stop is tried again."""
+
+    # What the reports of this stop have shown.
+    _block_gaps: int = 0
+    _gaps_needed: int = BLOCK_GAPS
+    _controlled: bool = False
+    """True if the control of this stop was passed: the report after a frame that does not block came on time."""
+    _delayed: int = 0
+    """Number of this stop's `MODE00` frames whose first report had another delay than the block, or none."""
+    _misfits: int = 0
+    """Number of intervals with a `MODE00` that were neither normal nor a block gap. Another program may be running."""
+
+    # The mode that the car is leaving.
     _other_mode_readings: int = 0
     """Number of consecutive readings in the form of another mode."""
     _other_mode_at: float | None = None

@@ -68,29 +68,35 @@ class StopInProgress(Struct):
     try_at: float
     """When the current try begins. Frames of other commands put it off."""
     commands: list[Pending] = field(default_factory=list)
+
+    # The current try.
     index: int = 0
     """Number of frames of the current try that are written."""
     try_decided_at: float = float("-inf")
     """When the current try was decided on."""
+    tries: int = 1
+    """Number of tries until now. Probes do not count, nor tries for a command that has joined the stop."""
+    report_wait_s: float = 0.0
+    """Minimum wait for a report after the last frame of a try, by the function of this name."""
+    due: float = float("inf")
+    """When the next step is due, by the last call of `due_at`. If its frame is written later, our loop was late."""
+
+    # The frames until now.
     first_at: float | None = None
     """When the first frame of the stop was written."""
     last_at: float = float("-inf")
     """When the last frame of the stop was written."""
+    closed_at: float = float("-inf")
+    """When the newest `MODE00` was written."""
     may_be_lost: bool = False
     """True if the car may have read the last frame of the stop behind another one, and ignored it."""
     other_at: float = float("-inf")
     """When the last frame of another command was written during the stop."""
-    closed_at: float = float("-inf")
-    """When the newest `MODE00` was written."""
-    tries: int = 1
-    worst_at: float = float("-inf")
-    """The time by which the motors are off, if all steps are in time and all frames arrive."""
-    timeout_s: float = EVIDENCE_TIMEOUT_S
-    """Timeout for the evidence, from the arrival of each command."""
-    report_wait_s: float = 0.0
-    """Minimum wait for a report after the last frame of a try, by the function of this name."""
-    due: float = float("inf")
-    """When the next step is due, by the last call of `due_at`."""
+    sent_once: bool = False
+    """True once a whole try was written, whichever try is under way now. A report that arrives after the block of a
+    `MODE00` counts as much: the car is in mode 0, and reads frames."""
+
+    # The reports until now.
     report_at: float = float("-inf")
     """Arrival of the last report of mode 0 that the car sent after the newest `MODE00`."""
     no_echo_at: float = float("-inf")
@@ -99,17 +105,23 @@ class StopInProgress(Struct):
     without_echo: int = 0
     """Number of reports without an echo in this stop, except those that came in the block of a `MODE00`."""
     probes: int = 0
-    sent_once: bool = False
-    """True once a whole try was written, whichever try is under way now. A report that arrives after the block of a
-    `MODE00` counts as much: the car is in mode 0, and reads frames."""
+    """Number of probes in this stop, and of reports that came on time although a `MODE00` should have delayed them."""
+
+    # The end of the stop.
+    case: StopCase = cases.MANUAL
+    """The case of the stop: it decides when the stop may end if the car does not show it."""
+    worst_at: float = float("-inf")
+    """The time by which the motors are off, if all steps are in time and all frames arrive."""
+    timeout_s: float = EVIDENCE_TIMEOUT_S
+    """Timeout for the evidence, from the arrival of each command."""
     overdue: bool = False
     """True if the car did not show the stop in time. The gateway continues to send it."""
+
+    # What it is for.
     mode_command: Pending | None = None
     """The mode command for which this stop is sent first."""
     repeats: bool = False
     """True if this stop repeats one whose first frames are written already. Then a command may replace it at once."""
-    case: StopCase = cases.MANUAL
-    """The case of the stop: it decides when the stop may end if the car does not show it."""
 
     @property
     def try_sent(self) -> bool:
