@@ -13,9 +13,8 @@ from tests.tools.walks import FORMS, rooms, stop_walk
 
 CARRYING_ROOMS: Final = 23
 """Rooms that carry `fleet stop red`, of which `python -m tests.tools.walks` has the names."""
-ROOMS_OF_STOP: Final = 66
+ROOMS_OF_STOP: Final = 65
 """All rooms that run only because of it, also who is asked for a time or a word. Two came with issue 33, and
-`schemas.bus.session_link` with the lost tokens of a link that has just opened, and
 `fleet.commands.exit_code` was a part of `options`."""
 ROOMS_OF_REPORT: Final = 37
 """Rooms from the bytes of a report until it is published and learned from."""

@@ -33,7 +33,6 @@ from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
 from schemas.bus.sample import Failure, Sample, sample_of, session_of, unread
-from schemas.bus.session_link import SessionLink
 from schemas.keys import renewal_key
 from schemas.process import signals
 from schemas.topics import Qos, Topic
@@ -68,6 +67,8 @@ TOKENS_OF_NOBODY: Final = "*/@hub"
 """A key for a query that is only a barrier. No such token exists, but everyone may ask for it: when the hub answers, it
 has handled all earlier messages of the session."""
 
+_NEWEST_EVENTS: Final = 16
+"""Number of kept events of a link. A session has one link at a time, and only the newest event matters."""
 _MAX_QUEUED_ANSWERS: Final = 1 << 16
 """Maximum number of queued answers of one query. If the queue is full, the link stalls, and Zenoh drops answers."""
 
@@ -524,6 +525,38 @@ class Bus:
         """Publish an encoded payload as it is, with this sequence number, or without one if it is 0."""
         source = zenoh.SourceInfo(self._session.id, (sequence - 1) & 0xFFFFFFFF) if sequence else None
         self._session.put(key, payload, encoding=encoding, source_info=source, **ZENOH_QOS[qos])
+
+
+class SessionLink:
+    """Follows the link of one session to its hub, from the moment in which it carries messages.
+
+    Zenoh lists a new link a moment before messages take it. Until then it answers each question for tokens at once, as
+    if there were none. The event of the link comes after that moment.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        # A ring never makes Zenoh wait, however seldom it is read.
+        events = session.info.declare_link_events_listener(zenoh.handlers.RingChannel(_NEWEST_EVENTS), history=True)
+        self._next_event = events.handler.try_recv
+        self._events = events  # the listener ends with this object
+        self._reading = threading.Lock()
+        self._opened = ""
+
+    @property
+    def address(self) -> str:
+        """Address of our end, which no two links share. Empty while messages reach no hub, and of a closed session."""
+        with self._reading:
+            try:
+                while (event := self._next_event()) is not None:
+                    if event.kind == zenoh.SampleKind.PUT:
+                        self._opened = str(event.link.src)
+                    elif self._opened == str(event.link.src):
+                        self._opened = ""
+                is_listed = any(str(link.src) == self._opened for link in self._session.info.links())
+            except zenoh.ZError:  # the session is closed, perhaps by another thread just now
+                return ""
+            return self._opened if is_listed else ""
 
 
 def _zenoh_threads() -> set[threading.Thread]:
