@@ -265,6 +265,7 @@ class YahboomDriver(Executor):
 
 
 def _as_wire_event(event: Event) -> WireEvent:
+    """Return the same event with its type. A gateway hands to its driver only what the driver's decoder has made."""
     return cast("WireEvent", event)
 
 

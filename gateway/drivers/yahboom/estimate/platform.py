@@ -67,9 +67,10 @@ class PlatformDetector:
     """The profile in force: the configured one, or with `auto` the detected one."""
     _found_contradictions: dict[str, _PlatformEvidence] = field(default_factory=dict)
     """Contradictions of the profile, in words, that hold or that some frames have shown."""
-    _with_modes: str = ""
-    _raspberry_pi: str = ""
-    """Evidence for a car with modes, and for a Raspberry Pi. If there is evidence for both, the platform is unknown."""
+    _evidence_of_modes: str = ""
+    _evidence_of_pi: str = ""
+    """The evidence for a car with modes, and for a Raspberry Pi, in words. Empty if there is none. If there is evidence
+    for both, the platform is unknown."""
     _one_kind_readings: int = 0
     """Number of consecutive readings that only one of the two kinds sends."""
     _one_kind_has_modes: bool = False
@@ -157,11 +158,11 @@ class PlatformDetector:
                 if self.auto:
                     self._detect(event)
                 if event.voltage_v is not None and event.voltage_v > TWO_CELLS_V:
-                    self._count_variant("3s")
+                    self._count_sign("3s")
             case ArmReading() | ImuReading():
-                new = self._count_option("arm" if isinstance(event, ArmReading) else "imu")
+                new = self._check_option("arm" if isinstance(event, ArmReading) else "imu")
             case TextLine():
-                self._count_variant("text")
+                self._count_sign("text")
                 return ()
             case Rejected(raw):
                 return self._count_head(head_of(raw))
@@ -204,12 +205,18 @@ class PlatformDetector:
         self._found_contradictions[words] = _PlatformEvidence(holds=True)
         return True
 
-    def _count_variant(self, option: str) -> None:
-        """Count one sign of a variant of the program. With `auto`, three signs add the option to the profile."""
+    def _count_sign(self, option: str) -> bool:
+        """Count one frame that shows an option. Return True at the third one, if the profile lacks the option.
+
+        With `auto`, the profile then gets the option.
+        """
         self._signs[option] = self._signs.get(option, 0) + 1
-        if self.auto and self._signs[option] == EVIDENCE_FRAMES and option not in self.profile.options:
+        if self._signs[option] != EVIDENCE_FRAMES or option in self.profile.options:
+            return False
+        if self.auto:
             self._options |= {option}
             self._apply_evidence()
+        return True
 
     def _check_profile(self, event: Sensors) -> tuple[str, ...]:
         """Update the contradictions of the profile. Only frames of mode 0 can end one."""
@@ -227,13 +234,9 @@ class PlatformDetector:
                 del self._found_contradictions[words]
         return new
 
-    def _count_option(self, option: str) -> tuple[str, ...]:
-        self._signs[option] = self._signs.get(option, 0) + 1
-        if self._signs[option] != EVIDENCE_FRAMES or option in self.profile.options:
-            return ()
-        if self.auto:
-            self._options |= {option}
-            self._apply_evidence()
+    def _check_option(self, option: str) -> tuple[str, ...]:
+        """Count one frame of a part that a car has only with this option. Return the contradiction if it is new."""
+        if not self._count_sign(option) or self.auto:
             return ()
         words = f"{option} frames, which {self.profile.name} cars do not send. Is it {self.profile.name}+{option}?"
         return (words,) if self.note(words) else ()
@@ -280,11 +283,11 @@ class PlatformDetector:
         for words, seen in self._observations.items():
             if seen.update(shown=shown[words]):
                 if words is _CONSTANT_READINGS:
-                    self._raspberry_pi = words
+                    self._evidence_of_pi = words
                 elif words is _WIDE_READINGS:
                     self._is_wide = True
                 else:
-                    self._with_modes = self._with_modes or words
+                    self._evidence_of_modes = self._evidence_of_modes or words
                 self._apply_evidence()
 
     def _count_one_kind(self, *, with_modes: bool, pi: bool) -> None:
@@ -294,28 +297,28 @@ class PlatformDetector:
             return
         self._one_kind_readings = self._one_kind_readings + 1 if with_modes is self._one_kind_has_modes else 1
         self._one_kind_has_modes = with_modes
-        if self._one_kind_readings != OTHER_PROGRAM_FRAMES or not (self._with_modes and self._raspberry_pi):
+        if self._one_kind_readings != OTHER_PROGRAM_FRAMES or not (self._evidence_of_modes and self._evidence_of_pi):
             return
         if with_modes:
-            self._raspberry_pi = ""
+            self._evidence_of_pi = ""
         else:
-            self._with_modes, self._is_wide = "", False
+            self._evidence_of_modes, self._is_wide = "", False
         self._apply_evidence()
 
     def forget(self) -> None:
         """Forget the evidence about the program, because another program is running."""
-        self._with_modes = self._raspberry_pi = ""
+        self._evidence_of_modes = self._evidence_of_pi = ""
         self._is_wide, self._one_kind_readings, self._readings = False, 0, 0
         for words in self._observations:
             self._observations[words] = _PlatformEvidence()
         self._apply_evidence()
 
     def _apply_evidence(self) -> None:
-        if bool(self._with_modes) is bool(self._raspberry_pi):
+        if bool(self._evidence_of_modes) is bool(self._evidence_of_pi):
             kind = self.configured.kind
         else:
             modes = Platform.STM32 if self._is_wide else Platform.ARDUINO
-            kind = modes if self._with_modes else Platform.RASPBERRY_PI
+            kind = modes if self._evidence_of_modes else Platform.RASPBERRY_PI
         knows_head = any(each.startswith(HEAD) for each in self._options)
         configured = self.configured.options
         options = self._options | (_without_head(configured) if knows_head else configured)
@@ -327,14 +330,14 @@ class PlatformDetector:
     def _evidence_for_profile(self) -> tuple[str, ...]:
         if not self.auto:
             return ()
-        if self._with_modes and self._raspberry_pi:
-            return (f"both {self._with_modes} and {self._raspberry_pi}: no known platform sends both",)
-        if self._with_modes and self._is_wide:
+        if self._evidence_of_modes and self._evidence_of_pi:
+            return (f"both {self._evidence_of_modes} and {self._evidence_of_pi}: no known platform sends both",)
+        if self._evidence_of_modes and self._is_wide:
             return (f"stm32: {EVIDENCE_FRAMES} {_WIDE_READINGS}",)
-        if self._with_modes:
-            return (f"{_WITH_MODES}: {EVIDENCE_FRAMES} {self._with_modes}",)
-        if self._raspberry_pi:
-            return (f"raspberry_pi: {EVIDENCE_FRAMES} {self._raspberry_pi}",)
+        if self._evidence_of_modes:
+            return (f"{_WITH_MODES}: {EVIDENCE_FRAMES} {self._evidence_of_modes}",)
+        if self._evidence_of_pi:
+            return (f"raspberry_pi: {EVIDENCE_FRAMES} {self._evidence_of_pi}",)
         if self.is_remembered:
             return (f"{self.profile.name}: detected before a mode was opened, in which the car may still be",)
         return (f"not settled: {EVIDENCE_FRAMES} readings in a row are needed",)

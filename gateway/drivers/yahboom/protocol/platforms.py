@@ -1,6 +1,7 @@
 """The kinds of cars: the frames that they understand, how they are stopped, and which of their readings are measured.
 
-Every number cites its row of docs/reference/protocol.md. The times are in `timing` and `modes`.
+Every number cites docs/reference/protocol.md: "platforms: speed" is the row `speed` of its section Platforms, and
+"programs that people have" is the section of that name. The times are in `timing` and `modes`.
 """
 
 from collections.abc import Mapping
