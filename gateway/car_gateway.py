@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from msgspec import Struct, field
@@ -185,9 +185,11 @@ class CarGateway:
             cars=self._estop_sync.on_tokens,
             poses=self._on_poses,
         )
+        keeping = asyncio.ensure_future(
+            self._link.keep_open(may_fail=self._settings.retry, is_in_use=self._is_port_in_use)
+        )
+        writing = asyncio.ensure_future(self._writer.run(self._flush))
         work = (
-            self._link.keep_open(may_fail=self._settings.retry, is_in_use=self._is_port_in_use),
-            self._writer.run(self._flush),
             self._tick(),
             self._keep_hub(),
             self._check_rival(),
@@ -196,14 +198,13 @@ class CarGateway:
             self._answer(self._service.values),
             self._answer(self._service.histories),
         )
-        tasks = [asyncio.ensure_future(each) for each in work]
-        writing = tasks[1]
+        tasks = [keeping, writing, *map(asyncio.ensure_future, work)]
         stopped = asyncio.ensure_future(self._writer.finished.wait())
         try:
             done, _ = await asyncio.wait([stopped, *tasks], return_when=asyncio.FIRST_COMPLETED)
             failed = [task for task in done if task is not stopped and task.exception() is not None]
             if failed:
-                if self._control.was_open and not writing.done():
+                if self._control.was_open and not writing.done():  # the car can still be stopped
                     if not self._ending:
                         self.stop()
                     await asyncio.wait([stopped, writing], return_when=asyncio.FIRST_COMPLETED)
@@ -211,22 +212,26 @@ class CarGateway:
                     self._fail_commands()
                 failed[0].result()
         finally:
-            running = {stopped, *tasks}
-            # wait_for of Python 3.11 may swallow a cancellation. `keep_open` would then reopen the link for ever.
-            while running:
-                for task in running:
-                    task.cancel()
-                _, running = await asyncio.wait(running, timeout=CANCEL_RETRY_S)
-            await asyncio.gather(stopped, *tasks, return_exceptions=True)
-            self._notifier.close()
-            if self._link.link is not None:
-                await self._link.link.close()
-            self._save_learned(self._loop.time(), at_once=True)
-            self._mark.end()
-            self._flush()
-            self._publisher.on_bus_connected(self._loop.time(), at_once=True)
-            self._publish_states(self._loop.time(), force=True)
+            await self._end({stopped, *tasks})
         return not self._driver.not_stopped
+
+    async def _end(self, tasks: set[asyncio.Future[Any]]) -> None:
+        """End all tasks, close the link, save what the next gateway needs, and publish the last states."""
+        running = tasks
+        # wait_for of Python 3.11 may swallow a cancellation. `keep_open` would then reopen the link for ever.
+        while running:
+            for task in running:
+                task.cancel()
+            _, running = await asyncio.wait(running, timeout=CANCEL_RETRY_S)
+        await asyncio.gather(*tasks, return_exceptions=True)
+        self._notifier.close()
+        if self._link.link is not None:
+            await self._link.link.close()
+        self._save_learned(self._loop.time(), at_once=True)
+        self._mark.end()
+        self._flush()
+        self._publisher.on_bus_connected(self._loop.time(), at_once=True)
+        self._publish_states(self._loop.time(), force=True)
 
     def stop(self) -> None:
         """Stop the car, then end. A second call ends at once."""
