@@ -124,7 +124,7 @@ class CarPublisher:
         sends such a thing.
         """
         name = "sensor/pose"
-        if sample.deleted or sample.unread:
+        if sample.deleted or sample.why_unread:
             self.dropped += 1
             return
         try:

@@ -49,7 +49,7 @@ class Request(NamedTuple):
     encoding: str
     by_wildcard: bool = False
     """True if one key expression addressed several cars."""
-    unread: str = ""
+    why_unread: str = ""
     """Why the payload was not read, or an empty text if it was."""
     identity: str = ""
     """The sender's identity, proven by a certificate. Empty on a bus without certificates."""
@@ -146,7 +146,7 @@ class CarService:
         is_history = any(each in query.parameters for each in ("_time", "last"))
         return (self.histories if is_history else self.values)((family, query))
 
-    def _on_command(self, query: zenoh.Query, unread: str = "") -> bool:
+    def _on_command(self, query: zenoh.Query, why_unread: str = "") -> bool:
         """Queue a command, also one that is too large to be read. Runs on a Zenoh thread."""
         expression = str(query.key_expr)
         verb = expression.rpartition("/")[2]
@@ -155,16 +155,16 @@ class CarService:
             return True
         request = Request(
             verb,
-            query.payload.to_bytes() if query.payload is not None and not unread else None,
-            str(query.encoding) if query.encoding is not None and not unread else "",
+            query.payload.to_bytes() if query.payload is not None and not why_unread else None,
+            str(query.encoding) if query.encoding is not None and not why_unread else "",
             by_wildcard="*" in expression,
-            unread=unread,
+            why_unread=why_unread,
             identity=keys.identity_of(expression),
             query=query,
         )
         if verb in STOPS:
             return self._commands(request, reserve=MAX_QUEUED_STOPS)
-        return (self._large if unread else self._commands)(request)
+        return (self._large if why_unread else self._commands)(request)
 
     def _admits(self, key: str, session: str) -> bool:
         """Return True if a drive of a stream is within the budget of its sender. Runs on a Zenoh thread."""
@@ -178,7 +178,7 @@ class CarService:
                 sample.payload,
                 sample.encoding,
                 by_wildcard="*" in sample.key,
-                unread=sample.unread,
+                why_unread=sample.why_unread,
                 identity=keys.identity_of(sample.key),
                 sampled_ns=sample.time_ns,
             )

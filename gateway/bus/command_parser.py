@@ -84,10 +84,10 @@ def parse(
     if request.by_wildcard and verb not in WILDCARD_VERBS:
         words = f"{verb} allows no wildcard: name one car (only {', '.join(WILDCARD_VERBS)} allow one)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)
-    if request.unread:
+    if request.why_unread:
         if verb not in STOPS:
-            raise BadRequest(Reason.BAD_VALUE, f"{verb}: {request.unread}", blank)
-        return _stop_anyway(blank, request.unread, request)
+            raise BadRequest(Reason.BAD_VALUE, f"{verb}: {request.why_unread}", blank)
+        return _stop_anyway(blank, request.why_unread, request)
     if request.payload is None and verb not in STOPS:
         words = f"{verb} has no payload: send {COMMANDS[verb].message} or its JSON (only stop and estop need none)"
         raise BadRequest(Reason.BAD_VALUE, words, blank)

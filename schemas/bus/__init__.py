@@ -33,7 +33,7 @@ from schemas.bus.sample import (
     messages_of,
     sample_of,
     sequence_of,
-    unread,
+    why_unread,
 )
 from schemas.bus.singleton import Singleton
 from schemas.bus.zenoh_session import Bus
@@ -80,5 +80,5 @@ __all__ = [
     "router_settings",
     "sample_of",
     "sequence_of",
-    "unread",
+    "why_unread",
 ]

@@ -33,7 +33,7 @@ class Sample(NamedTuple):
     sequence: int
     """The publisher's sequence number for the key, modulo 2^32. 0 if there is none."""
     deleted: bool = False
-    unread: str = ""
+    why_unread: str = ""
     """The reason if the payload was not read because it is too large. Empty if it was read."""
 
     def message(self) -> "Message":
@@ -83,15 +83,15 @@ def sample_of(sample: zenoh.Sample, largest: int | None = None) -> Sample:
     """Convert a Zenoh sample. `largest` is the maximum size of the payload in bytes."""
     stamp = sample.timestamp
     info = sample.source_info
-    unread = "" if largest is None else _too_many_bytes(len(sample.payload), largest)
+    why_unread = "" if largest is None else _too_many_bytes(len(sample.payload), largest)
     return Sample(
         key=str(sample.key_expr),
-        payload=b"" if unread else sample.payload.to_bytes(),
+        payload=b"" if why_unread else sample.payload.to_bytes(),
         encoding=str(sample.encoding),
         time_ns=stamp.get_time_as_ntp64().as_nanos() if stamp is not None else time.time_ns(),
         sequence=sequence_of(info) if info is not None else 0,
         deleted=sample.kind == zenoh.SampleKind.DELETE,
-        unread=unread,
+        why_unread=why_unread,
     )
 
 
@@ -101,7 +101,7 @@ def _too_many_bytes(size: int, largest: int) -> str:
     return f"a payload of {size} bytes is too large and was not read: the limit is {largest} bytes"
 
 
-def unread(query: zenoh.Query) -> str:
+def why_unread(query: zenoh.Query) -> str:
     """Return why a query is not read: some part of it is too large. Return an empty string if all parts fit."""
     payload = query.payload
     if payload is not None and (words := _too_many_bytes(len(payload), LARGEST_PAYLOAD)):

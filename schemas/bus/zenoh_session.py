@@ -32,7 +32,7 @@ from schemas.bus.errors import BusError, NoFleet
 from schemas.bus.overlap import TWIN_S, Overlap, mark_of_query, mark_of_sample
 from schemas.bus.publisher import ZENOH_QOS, Publisher
 from schemas.bus.replies import BUSY, refuse
-from schemas.bus.sample import Failure, Sample, sample_of, session_of, unread
+from schemas.bus.sample import Failure, Sample, sample_of, session_of, why_unread
 from schemas.keys import renewal_key
 from schemas.process import signals
 from schemas.topics import Qos, Topic
@@ -337,9 +337,9 @@ class Bus:
     ) -> Declared:
         """Subscribe. The callback runs on a Zenoh thread, so it must hand the sample over and return.
 
-        `largest` is the maximum size of a payload in bytes (see `Sample.unread`). `admits` is called with the key of
-        each message and the session that published it, before anything else is read (see `session_of`). If it returns
-        False, the message is dropped.
+        `largest` is the maximum size of a payload in bytes (see `Sample.why_unread`). `admits` is called with the key
+        of each message and the session that published it, before anything else is read (see `session_of`). If it
+        returns False, the message is dropped.
         """
         declaration = next(self._next_declaration)
 
@@ -380,7 +380,7 @@ class Bus:
 
         def declare(session: zenoh.Session, number: int) -> Any:
             def on_query(query: zenoh.Query) -> None:
-                words = unread(query)
+                words = why_unread(query)
                 if self._is_twin(number, lambda: mark_of_query(declaration, query), TWIN_S):
                     with query:  # leave it unanswered, because its other copy gets an answer
                         return

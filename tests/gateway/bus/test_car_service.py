@@ -63,16 +63,16 @@ async def test_oversized_request_is_handed_over_unread_with_reason(hall: tuple[H
     for verb in ("drive", "stop"):
         await asyncio.to_thread(ask, asker, f"@cmd/{verb}", LARGE)
     await there.until(lambda: len(there.requests) == 2, "both commands")
-    assert {each.unread for each in there.requests} == {
+    assert {each.why_unread for each in there.requests} == {
         "a payload of 5000000 bytes is too large and was not read: the limit is 65536 bytes"
     }
-    assert await asyncio.to_thread(ask, asker, "sensor/range", LARGE) == [there.requests[0].unread]
+    assert await asyncio.to_thread(ask, asker, "sensor/range", LARGE) == [there.requests[0].why_unread]
     (long,) = await asyncio.to_thread(ask, asker, f"state/link?a={'x' * 5000}")
     assert "4096" in long
     asker.put_command(keys.command_key("fleet", "red", "drive"), LARGE, "application/json")
     await there.until(lambda: len(there.requests) == 3, "a streamed drive")
     assert (there.requests[2].streamed, there.requests[2].payload) == (True, b"")
-    assert there.requests[2].unread == there.requests[0].unread
+    assert there.requests[2].why_unread == there.requests[0].why_unread
 
 
 async def test_history_queries_have_own_bounded_queue(hall: tuple[Hall, bus.Bus]) -> None:

@@ -365,11 +365,11 @@ def test_deep_json_is_refused_in_no_time() -> None:
 
 
 def test_unread_payload_is_refused_but_stop_is_obeyed() -> None:
-    error = refused("drive", None, unread="it is too large")
+    error = refused("drive", None, why_unread="it is too large")
     assert error.reason is Reason.BAD_VALUE
     assert error.words.startswith("drive: ")
     assert "too large" in error.words
-    stop = ask("stop", None, unread="it is too large")
+    stop = ask("stop", None, why_unread="it is too large")
     assert stop.what == Stop()
     assert "too large" in stop.note
-    assert ask("estop", None, unread="too large", by_wildcard=True).what == EmergencyStop()
+    assert ask("estop", None, why_unread="too large", by_wildcard=True).what == EmergencyStop()
