@@ -118,7 +118,13 @@ def bus_lost_words(car: str) -> str:
 
 
 class Progress:
-    """The progress of one command on one car. `outcome` is None until it is known."""
+    """The progress of one command on one car. `outcome` is None until it is known.
+
+    Whoever asks must get an outcome soon, but must not be told that a command has failed that is only late. So the time
+    to give up (`deadline`) depends on what is known of it. Without an answer, it is as long as an overloaded computer
+    may take. If the gateway is gone, it is as long as the gateway needs to come back, or a supervisor to start another
+    one. With an answer, it is as long as the command itself may take, and a margin.
+    """
 
     def __init__(
         self, car: str, until: Until, asked_at: float, duration_s: float = 0.0, *, verb: str = "", detail: str = ""
@@ -134,13 +140,17 @@ class Progress:
         self._basis = ""
         self._last_event_at = asked_at
         self._timeout_from = asked_at
+        """When the time that the command itself may take begins: when it was asked, when a late answer came, or when
+        the frame of a drive was sent."""
         self._worst_case_s = 0.0
         self._queued = False
         self.why_waiting = ""
         """Why the command waits for its car, and for how long at most, in the gateway's words. Empty once its frame is
         sent."""
         self._sent_event = False
+        """True if the gateway has sent the event `sent`. The answer to the query may say so long before."""
         self._gone_at: float | None = None
+        """When the token of the gateway disappeared. None while the gateway is on the bus."""
         self._is_supervised = False
         self._foreign = ""
         """The text about another program that answered."""
