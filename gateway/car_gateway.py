@@ -141,8 +141,8 @@ class CarGateway:
             url,
             self._control,
             self._publisher,
-            self._commands,
             self._wake,
+            log=self._commands.log,
             on_gap=self._on_gap,
             log_open=self._log_link_open,
         )

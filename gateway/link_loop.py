@@ -10,7 +10,6 @@ from collections.abc import Awaitable, Callable
 from typing import Final
 
 from gateway.bus.car_publisher import RAW_PER_S, CarPublisher
-from gateway.bus.command_handler import CommandHandler
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver, Echo, Event, Rejected, TextLine
 from gateway.control.link_health import LinkHealth
@@ -43,14 +42,15 @@ class LinkLoop:
         url: LinkUrl,
         control: Controller[Driver],
         publisher: CarPublisher,
-        commands: CommandHandler,
         wake: WriterWakeup,
         *,
+        log: Callable[[Level, str, str], None],
         on_gap: Callable[[float], None],
         log_open: Callable[[], None],
     ) -> None:
         """Make the loop of a link. `on_gap` is called before bytes are decoded, to detect a gap of the asyncio loop.
 
+        `log` logs and publishes an event of the gateway: its level, its code, and its words.
         `log_open` logs that the link is open. It is called when the link opens. After a link that was lost before it
         was proven, it is called only when the new link is proven: by a reading or an echo, or by its age (see
         `Attempts`).
@@ -65,9 +65,9 @@ class LinkLoop:
         self._control = control
         self._driver = control.driver
         self._publisher = publisher
-        self._commands = commands
         self._wake = wake
         self._on_gap = on_gap
+        self._log = log
         self._log_open = log_open
         self._baud = BaudWatch(url)
         self._flood_until = now
@@ -142,7 +142,7 @@ class LinkLoop:
                 self.on_events(self._driver.feed(data[start : start + SLICE_BYTES], now))
             if (doubt := self._baud.on_bytes(data)) is not None:
                 self.health.on_rejected(doubt.cause, 1)
-                self._commands.log(Level.WARNING, "no_frames", doubt.words)
+                self._log(Level.WARNING, "no_frames", doubt.words)
             if self._publisher.is_outdated:
                 self._wake.set()
             self._wake.set_if_due(now)
@@ -155,7 +155,7 @@ class LinkLoop:
                 f"{self._car} sends more bytes than any car: another device, or a wrong baud rate? "
                 f"The gateway publishes {RAW_PER_S:g} raw frames a second and counts the rest in state/link."
             )
-            self._commands.log(Level.WARNING, "flood", words)
+            self._log(Level.WARNING, "flood", words)
         self._flood_until = now + FLOOD_LOG_PAUSE_S
 
     def on_events(self, events: list[Event]) -> None:
@@ -185,7 +185,7 @@ class LinkLoop:
         self.health.on_lost(reason, now)
         self._driver.link_down(reason, now)
         if self._attempts.on_failed(reason):
-            self._commands.log(Level.WARNING, "link_lost", reason)
+            self._log(Level.WARNING, "link_lost", reason)
         self._wake.set()
 
     def check(self, now: float) -> None:
@@ -205,7 +205,7 @@ class LinkLoop:
         if trouble and trouble != self._trouble:
             self._trouble = trouble
             self.health.on_rejected("port_shared")
-            self._commands.log(Level.WARNING, "port_shared", trouble)
+            self._log(Level.WARNING, "port_shared", trouble)
 
 
 def at_rate(url: LinkUrl, baud: int) -> LinkUrl:

@@ -22,11 +22,13 @@ def product_nodes() -> Iterator[ast.AST]:
 
 
 def logged() -> set[tuple[str, str]]:
-    """Return level and code of each call `log(Level.X, "code", ...)`."""
+    """Return level and code of each call `log(Level.X, "code", ...)`, or `_log`."""
     found = set()
     for node in product_nodes():
         match node:
-            case ast.Call(func=ast.Attribute(attr="log"), args=[ast.Attribute(attr=level), ast.Constant(code), *_]):
+            case ast.Call(
+                func=ast.Attribute(attr="log" | "_log"), args=[ast.Attribute(attr=level), ast.Constant(code), *_]
+            ):
                 found.add((str(Level[level]), str(code)))
     return found
 
