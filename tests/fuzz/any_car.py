@@ -50,7 +50,7 @@ def draw_car(moments: random.Random, *, modes: bool) -> DrawnCar:
         close_s=moments.choice(CLOSES_S),
         last_frame_wins=moments.random() < 0.2,
         silent_modes=frozenset(mode for mode in _PRINTING if moments.random() < 0.15),
-        first_reading_s=_first_reading_s(random.Random(hash(moments.getstate()))),  # so that older draws stay
+        first_reading_s=_first_reading_s(random.Random(hash(moments.getstate()[1]))),  # so that older draws stay
         text=moments.random() < 0.2,
         readings=readings,
     )
