@@ -54,8 +54,8 @@ SUPERVISOR_HUB_RESTART_DELAY_S: Final = 0.3
 """Time without a link after which the supervisor starts a hub in place of another program's. Other programs would start
 one after 0.5 s."""
 RECORDER_START_TIMEOUT_S: Final = 5.0
-"""Timeout for the recorder's first heartbeat. Gateways start only after this heartbeat or timeout, so that the recorder
-misses nothing."""
+"""Timeout for the recorder's first heartbeat. Gateways and the coordinator start only after this heartbeat or timeout,
+so that the recorder misses nothing."""
 SILENT_PROCESS_S: Final = 3.0
 """Silence after which a process is named as not ready. It has then missed at least two heartbeats, and may hang."""
 RECORDER_LOST_S: Final = 2.0
@@ -115,7 +115,7 @@ class Supervisor:
         self._began_wall_s = time.time()
         self._unlinked_since = self.processes.now
         self._linked_since: float | None = None
-        self._gateways_from = 0.0
+        self._recorded_from = 0.0
         self._shutdown_requested = asyncio.Event()
         self._tries_until = inf
         self._reloading = asyncio.Lock()
@@ -295,7 +295,7 @@ class Supervisor:
     def _populate(self) -> None:
         if self._spec.record:
             self.processes.add(RECORDER, ProcessKind.RECORDER, spec.recorder_command(self._spec, self.endpoint))
-            self._gateways_from = self._recorder_heard_at = self.processes.now + RECORDER_START_TIMEOUT_S
+            self._recorded_from = self._recorder_heard_at = self.processes.now + RECORDER_START_TIMEOUT_S
         if self._spec.simulated:
             command = spec.simulator_command(self._spec, self.processes.directory, self.endpoint)
             self.processes.add(SIMULATOR_PROCESS, ProcessKind.SIMULATOR, command)
@@ -416,7 +416,8 @@ class Supervisor:
     def _may_start(self, process: ManagedProcess) -> bool:
         if process.kind is ProcessKind.HUB or self._shutdown.may_start(process.name):
             return True
-        waits = process.kind is ProcessKind.GATEWAY and self.processes.now < self._gateways_from
+        recorded = process.kind in {ProcessKind.GATEWAY, ProcessKind.COORDINATOR}
+        waits = recorded and self.processes.now < self._recorded_from
         return not waits and not self._shutdown_requested.is_set()
 
     # ------------------------------------------------------------------ callbacks
@@ -449,7 +450,7 @@ class Supervisor:
         row = self.rows.get(car)
         if car == RECORDER:
             if self.processes.on_heartbeat(RECORDER):
-                self._gateways_from = self.processes.now
+                self._recorded_from = self.processes.now
             self._recorder_heard_at = self.processes.now
             self._drops[value.session] = sum(value.drops.values())
             self._session = "" if value.state == RecorderState.STOPPED else value.session

@@ -527,6 +527,17 @@ def test_simulated_cars_that_have_no_link_yet_do_a_plan(tmp_path: Path) -> None:
             wait_for(lambda car=car, mode=mode: _asked(started, car) == mode, f"{car} is told its role")
 
 
+def test_recording_has_the_plan_from_its_first_message(tmp_path: Path) -> None:
+    with Up(tmp_path, free_endpoint(), str(_job(tmp_path, link="")), "--sim", "2") as started:
+        started.until("process", "@coordinator", "started")
+        recorder = [each["words"] for each in started.heard if each["name"] == "@recorder"]
+        assert any("recording to" in words for words in recorder), f"the recorder has only said: {recorder}"
+        wait_for(lambda: started.get("@coordinator/assignment"), "the coordinator has decided")
+        assert started.fleet("down").returncode == 0
+    first = next(Session(str(next(started.out.glob("*-fleet")))).messages("@coordinator/plan"))
+    assert first.sequence == 1
+
+
 def test_reload_tells_the_coordinator_what_the_cars_may_do_now(job: Up) -> None:
     _job(job.directory, ann="seek", bob="follow")
     told = job.fleet("reload").stdout
