@@ -36,6 +36,7 @@ from schemas.words import RecorderState, RecorderVerb
 
 if TYPE_CHECKING:
     from fleet.fleetfile.fleet_file import PinRule
+    from fleet.recording.writing.recorder import Recorder
     from schemas.rights import People
 
 POLL_INTERVAL_S: Final = 0.25
@@ -191,29 +192,16 @@ def run(
         with Bus.open(connect, start_hub=True, identity=identity) as bus:
             pins, people = _pins_and_people(fleet_file)
             recorder = Recorder(bus, fleet, place, options, site=site, pins=pins, people=people, notify=_warn)
-            session = recorder.start()
-            if full := recorder.full:
-                _say(
-                    as_json,
-                    {"session": str(session), "state": RecorderState.FULL},
-                    f"{keys.describe_fleet(fleet)} is not recorded until there is room: {full}",
-                )
-            else:
-                _say(
-                    as_json,
-                    {"session": str(session), "state": RecorderState.RECORDING},
-                    f"recording {keys.describe_fleet(fleet)} to {session}",
-                )
-            _wait(bus, stop, recorder.ended, parent)
-            outcome = recorder.close()
+            session = _start(recorder, place)
+            try:
+                _say_begun(as_json, fleet, session, recorder.full)
+                _wait(bus, stop, recorder.ended, parent)
+            finally:  # or its threads would keep this process for ever, if nobody reads what it says
+                outcome = recorder.close()
     except (BadEndpoint, keys.BadKey) as error:
         raise click.UsageError(str(error)) from None
     except (BusError, AnotherRecorder, RecordingFailed) as error:
         raise click.ClickException(str(error)) from None
-    except OSError as error:
-        raise click.ClickException(
-            f"No session can be created in {place}: {error.strerror}. Name another place with --sessions."
-        ) from None
     session = outcome.session  # a new session may have begun meanwhile
     _say(
         as_json,
@@ -230,6 +218,24 @@ def run(
     )
     if outcome.error:
         raise click.ClickException(outcome.error)
+
+
+def _start(recorder: "Recorder", place: Path) -> Path:
+    try:
+        return recorder.start()
+    except OSError as error:
+        raise click.ClickException(
+            f"No session can be created in {place}: {error.strerror}. Name another place with --sessions."
+        ) from None
+
+
+def _say_begun(as_json: bool, fleet: str, session: Path, full: str) -> None:  # noqa: FBT001 - the flag of the command
+    if full:
+        values = {"session": str(session), "state": RecorderState.FULL}
+        _say(as_json, values, f"{keys.describe_fleet(fleet)} is not recorded until there is room: {full}")
+    else:
+        values = {"session": str(session), "state": RecorderState.RECORDING}
+        _say(as_json, values, f"recording {keys.describe_fleet(fleet)} to {session}")
 
 
 def _wait(bus: Bus, stop: threading.Event, ended: threading.Event, parent: int | None) -> None:

@@ -60,6 +60,22 @@ def test_signal_closes_the_session_whole(number: signal.Signals, endpoint: str, 
     assert opened.description.closed
 
 
+def test_nobody_reads_it_and_it_ends_with_a_closed_session(endpoint: str, bus: Bus, tmp_path: Path) -> None:
+    nobody, stdout = os.pipe()
+    os.close(nobody)
+    arguments = ("--sessions", str(tmp_path), "--connect", endpoint)
+    with subprocess.Popen([sys.executable, "-c", RECORD, *arguments], stdout=stdout, stderr=subprocess.PIPE) as process:
+        os.close(stdout)
+        try:
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert (process.returncode, errors) == (1, b""), "no other place was wrong"
+    description = Session(next(tmp_path.glob("*-fleet"))).description
+    assert description is not None
+    assert description.closed
+
+
 def test_killed_it_loses_at_most_the_last_second(endpoint: str, bus: Bus, tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
     """Time of each status, and its number of messages."""
