@@ -33,6 +33,7 @@ from fleet.recording.tools.table_formats import ArrowSink, FormatMissing, import
 from fleet.recording.tools.tables import Layout
 from schemas import messages, topics
 from schemas.printable import printable_lines
+from schemas.suggestion import did_you_mean
 from schemas.topics import TOPICS, Topic
 
 if TYPE_CHECKING:
@@ -57,10 +58,11 @@ MAX_QUERY_ATTEMPTS: Final = 4
 """Maximum number of attempts for one question. Each looks for the sessions again, because the quota may have deleted
 some, and sessions that grow get new tables."""
 _ASKS_FOR_VIEWS: Final = re.compile(r"\b(show|pragma|information_schema|query_table|duckdb_\w+|pg_\w+|sqlite_\w+)\b")
+_NO_TABLE: Final = re.compile(r"Table with name (.+?) does not exist!")
 
 
 class BadQuery(ValueError):
-    """A question that DuckDB does not understand. The text is DuckDB's, on one line."""
+    """A question that DuckDB does not understand. The text is one line: DuckDB's, or that there is no such table."""
 
 
 class QueryFailed(RuntimeError):
@@ -182,7 +184,7 @@ class Catalog:
                 attempts -= 1
                 if not attempts or not _is_gone(error):
                     kind = QueryFailed if isinstance(error, self._duckdb.OperationalError) else BadQuery
-                    raise kind(_one_line(str(error))) from None
+                    raise kind(_no_table(str(error)) or _one_line(str(error))) from None
             self._find()
 
     def _answer(self, sql: str, parameters: Sequence[Any]) -> "pa.Table":
@@ -361,6 +363,21 @@ def _text(value: str) -> str:
 
 def _is_gone(error: Exception) -> bool:
     return "No such file" in str(error) or "No files found" in str(error)
+
+
+def _no_table(text: str) -> str:
+    """Return what DuckDB says about a missing table with the likely name. Empty if it says something else.
+
+    DuckDB's own suggestion is wrong, because it knows only the views that questions have named so far.
+    """
+    missing = _NO_TABLE.search(text)
+    if missing is None:
+        return ""
+    views = [view_name(topic.name) for topic in TOPICS.values()]
+    contexts = [f"{view_name(topic.name)}_context" for topic in TOPICS.values() if topic.family == "sensor"]
+    near = did_you_mean(missing[1], [*views, *contexts])
+    words = f"There is no table {missing[1]}. {near or '`fleet query --tables` lists all.'}"
+    return printable_lines(words)
 
 
 def _one_line(text: str) -> str:

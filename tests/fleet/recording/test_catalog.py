@@ -38,6 +38,7 @@ from tests.support.no_superuser import no_superuser
 from tests.support.processes import wait_for
 from tests.support.soaks import only_in_soak
 from tests.support.terminal import Terminal
+from tests.support.text_parts import has_parts
 
 OLD_SESSION = Path(__file__).parents[2] / "vectors" / "session-0.1"
 
@@ -131,6 +132,20 @@ def test_bad_query_is_refused_in_one_line(sessions: Path, sql: str) -> None:
     with pytest.raises(BadQuery) as refused:
         Catalog(sessions).query(sql)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("sensor_rnage", "Did you mean sensor_range?"),
+        ("sensor_range_contxt", "Did you mean sensor_range_context?"),
+        ("nowhere", "fleet query --tables"),
+    ],
+)
+def test_misspelled_table_is_named_with_the_likely_one(sessions: Path, wrong: str, words: str) -> None:
+    with pytest.raises(BadQuery) as refused:
+        Catalog(sessions).query(f"SELECT * FROM {wrong}")
+    assert has_parts(str(refused.value), f"{wrong} … {words}")
 
 
 def test_quote_in_session_name_is_no_sql(sessions: Path) -> None:
