@@ -5,6 +5,7 @@ from typing import Final
 from fleet.client.client import Fleet
 from schemas import keys
 from schemas.bus.passing_on import passes_on
+from schemas.identity import IdentityRole, role_of
 
 _LOOK_S: Final = 1.5
 """Time to look for our token. After a change of its rules, a hub has everybody connected again within half a second."""
@@ -16,6 +17,10 @@ def why_refused(client: Fleet) -> str:
     if not identity:
         return ""
     token = keys.operator_token(client.name, client.sender)
+    if role_of(identity) is IdentityRole.CAR:
+        # The hub passes on a car's token only under the name of the car, and the sender is the user of its computer.
+        token = keys.operator_token(client.name, f"{identity.partition('.')[2]}@{client.sender.partition('@')[2]}")
+        client.bus.token(token)
     if passes_on(client.bus, token, _LOOK_S) is not False:
         return ""
     return (

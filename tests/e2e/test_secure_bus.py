@@ -324,6 +324,13 @@ def test_gateway_stops_its_car_when_its_certificate_is_revoked_elsewhere(
     assert {each["car"]: each["findings"][0]["code"] for each in told if each["findings"]}["blue"] == "gateway_unheard"
 
 
+@pytest.mark.parametrize("identity", [ANN, RED, service(Service.RECORDER)])
+def test_nobody_with_a_valid_certificate_is_called_revoked(stage: SecureStage, identity: str) -> None:
+    """A person who has joined as a car also looks who is there, before the first gateway runs."""
+    with Client(stage.store.credentials.endpoint, kind="person", identity=identity) as client:
+        assert why_refused(client) == ""
+
+
 def test_revoked_person_gets_nothing_and_others_reconnect(stage: SecureStage) -> None:
     """One of the last in this file: eve is gone after it."""
 
