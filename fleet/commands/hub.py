@@ -1,6 +1,7 @@
 """`fleet hub`, `fleet join`, `fleet leave`: a bus with certificates and rules, on one computer or on several."""
 
 import json
+import os
 import re
 import sys
 import time
@@ -26,7 +27,16 @@ from fleet.hub.invitation import Invitation
 from fleet.hub.join import JOIN_PORT, join, join_one_of
 from fleet.hub.join_code import JOIN_CODE_LIFETIME_S, JoinCode
 from schemas import identity, keys
-from schemas.bus import LOOPBACK, Bus, BusError, is_loopback, is_secure, resolve_endpoint, router_settings
+from schemas.bus import (
+    ENDPOINT_VARIABLE,
+    LOOPBACK,
+    Bus,
+    BusError,
+    is_loopback,
+    is_secure,
+    resolve_endpoint,
+    router_settings,
+)
 from schemas.bus.credentials import Credentials
 from schemas.bus.hub_links import LINKS_FILE
 from schemas.identity import IdentityRole, Service
@@ -92,6 +102,7 @@ def init(cars: tuple[str, ...], services: tuple[str, ...], *, local: bool) -> No
         "keep a copy of ca.key and ca.pem in a safe place.\n`fleet up` starts it. `fleet hub invite NAME` lets "
         "the computer of a person join, and `fleet hub invite --car NAME` a computer with a car."
     )
+    _say_of_other_bus(endpoint)
 
 
 @hub.command(
@@ -279,9 +290,11 @@ def join_hub(words: tuple[str, ...], site: str | None) -> None:
                 f"its users on {name}, and let them join with --at. On this computer, that is `fleet join {name} CODE "
                 "--at 127.0.0.1`."
             )
+            _say_of_other_bus(endpoint)
             return
         said = _describe_cars_on(endpoint, SITE_RULES_S if site else HUB_RESTART_S)
     click.echo(f"You are {joined.identity} at {endpoint} now. {said}")
+    _say_of_other_bus(endpoint)
     if joined.fleet_file and not DEFAULT_FLEET_FILE.exists():
         try:
             DEFAULT_FLEET_FILE.write_text(joined.fleet_file, encoding="utf-8")
@@ -372,11 +385,23 @@ def _tries(within_s: float) -> Iterator[bool]:
     yield True
 
 
+def _say_of_other_bus(endpoint: str) -> None:
+    """Warn if the environment keeps all commands from the hub at this endpoint."""
+    if (other := os.environ.get(ENDPOINT_VARIABLE)) and other != endpoint:
+        words = f"Your commands do not use this hub yet, because {ENDPOINT_VARIABLE} is {other}."
+        click.echo(f"{words} Type: unset {ENDPOINT_VARIABLE}", err=True)
+
+
 def _own_store(endpoint: str) -> HubStore:
     if not is_secure(endpoint) or not (store := HubStore.of(endpoint)).is_hub:
         if is_secure(endpoint) and (first := Credentials.of(endpoint).first_hubs):
             raise click.ClickException(
                 f"This computer is the hub of another site: use these commands on {first[0]}, the main hub."
+            )
+        if os.environ.get(ENDPOINT_VARIABLE) and (joined := joined_endpoint()) and local_hub.is_hub_here(joined):
+            raise click.ClickException(
+                f"{ENDPOINT_VARIABLE} is {endpoint}, but this computer is the hub at {joined}. Type: "
+                f"unset {ENDPOINT_VARIABLE}"
             )
         raise click.ClickException(
             f"This computer is not a hub ({endpoint}). `fleet hub init` makes it one. Only a hub has these commands."

@@ -12,6 +12,7 @@ from schemas.identity import Service, service
 from schemas.running_cars import RunningMark
 from schemas.state_dir import DEFAULT_ENDPOINT, directory_of
 from tests.support import in_process
+from tests.support.text_parts import has_parts
 
 
 @pytest.mark.parametrize(
@@ -61,3 +62,20 @@ def test_service_invited_elsewhere_is_taken_back(monkeypatch: pytest.MonkeyPatch
         Credentials.of(SECURE_ENDPOINT).identity(recorder)
     assert in_process.fleet("hub", "init", "--local", "--service", "recorder").returncode == 0
     assert Credentials.of(SECURE_ENDPOINT).identity(recorder) == recorder
+
+
+def test_other_bus_in_the_environment_is_told_with_the_way_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: object
+) -> None:
+    """The hub would be set up, and no command would use it: the next one said that this computer was no hub."""
+    monkeypatch.setenv("FLEET_STATE_DIR", str(tmp_path))
+    monkeypatch.setenv("FLEET_ENDPOINT", other := "tcp/192.0.2.1:7447")
+    done = in_process.fleet("hub", "init", "--local")
+    assert done.returncode == 0
+    assert has_parts(done.stderr, f"{other} … unset FLEET_ENDPOINT")
+    refused = in_process.fleet("hub", "show")
+    assert refused.returncode == 1
+    assert has_parts(refused.stderr, f"{other} … {SECURE_ENDPOINT} … unset FLEET_ENDPOINT")
+    monkeypatch.delenv("FLEET_ENDPOINT")
+    assert in_process.fleet("hub", "init", "--local").stderr == ""
+    assert in_process.fleet("hub", "show").returncode == 0
