@@ -152,7 +152,8 @@ def _summaries(directory: Path | None) -> list["SessionSummary"]:
             raise click.ClickException(f"{why} `fleet sessions` without DIR lists the sessions here.") from None
         found = []
     if not found:
-        click.echo(f"No recordings here yet (in {place}). `fleet up` records everything.", err=True)
+        words = f"No recordings here yet (in {place}). `fleet up` records in the directory where it is typed."
+        click.echo(words, err=True)
     return found
 
 

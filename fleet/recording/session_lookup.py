@@ -90,7 +90,7 @@ def find_session(session: str | os.PathLike[str], place: Path | None = None) -> 
     if not found and any(sessions_in(place)):
         raise NoLatest(f"All sessions in {place} are made of others: name one of them (`fleet sessions` lists them).")
     if not found:
-        raise NoLatest(f"No recordings here yet (in {place}). `fleet up` records everything.")
+        raise NoLatest(f"No recordings here yet (in {place}). `fleet up` records in the directory where it is typed.")
     back = int(match[1] or 0)
     if back >= len(found):
         count = "is only 1 recorded session" if len(found) == 1 else f"are only {len(found)} recorded sessions"
