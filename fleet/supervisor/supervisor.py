@@ -6,6 +6,7 @@ It contains the loop that joins the other modules of this package, and the order
 import asyncio
 import json
 import os
+import shlex
 import socket
 import time
 from collections import deque
@@ -656,9 +657,8 @@ class Supervisor:
         for line in words:
             self._say("process", SELF, f"reload by {name_of(sender)}: {line}")
         if found.needs_restart:
-            raise RestartNeeded(
-                "\n".join([*words, *found.spec.warnings, "Restart the fleet: `fleet down`, `fleet up`."])
-            )
+            advice = f"Restart the fleet: `fleet down`, `fleet up {shlex.quote(self._source)}`."
+            raise RestartNeeded("\n".join([*words, *found.spec.warnings, advice]))
         return "\n".join([*(words or ["nothing has changed"]), *found.spec.warnings])
 
     def _say(self, what: str, name: str, words: str) -> None:

@@ -478,7 +478,7 @@ def test_reload_applies_what_it_can_and_bad_file_changes_nothing(fleet: FleetPro
         assert (done.returncode, done.stdout) == (1, "")
         assert [line.split(":")[0] for line in done.stderr.splitlines()[:2]] == ["blue is added", "green is removed"]
         assert "the fleet's name" in done.stderr
-        assert "`fleet down`, `fleet up`" in done.stderr
+        assert f"`fleet down`, `fleet up {file}`" in done.stderr, "without its name, it would start another file"
         started.ready("blue")
         wait_for(lambda: started.state("green") is None, "green's gateway has ended")
         assert started.running("red") == before["red"]
