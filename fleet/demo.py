@@ -5,6 +5,7 @@ Checks compare what a gateway believes with the truth: the simulator publishes t
 
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -124,6 +125,8 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
         run = Demo(out.resolve(), _free_endpoint(), say)
         with signals.sigterm_interrupts():
             session, rrd = _run(run)
+    except BrokenPipeError:  # nobody reads what we say, so another directory would not help
+        raise
     except OSError as error:
         raise click.ClickException(f"No demo in {out}: {error.strerror}. Name another place with --sessions.") from None
     failed = [check for check in run.checks if not check.ok]
@@ -136,7 +139,7 @@ def demo(out: Path, *, as_json: bool, view: bool | None) -> None:
         }
         click.echo(json.dumps(result))
     else:
-        newest = "latest" if out == DEFAULT_OUT else session
+        newest = "latest" if out == DEFAULT_OUT else shlex.quote(str(session))
         passed = f"{len(run.checks) - len(failed)} of {len(run.checks)} checks passed."
         click.echo(f"\n{passed} Look at it: fleet replay {newest}")
     if failed:

@@ -44,6 +44,7 @@ def replay(
     """Look at a session in Rerun: the newest, or a directory or .mcap file that you name."""
     quiet_rerun()
     from fleet.recording.reading.session import NoSession, Session
+    from fleet.recording.tools.summary import typed_name
     from fleet.replay.rerun.viewer import has_display
 
     try:
@@ -53,7 +54,8 @@ def replay(
             check_target(save, found.segments)
         elif not has_display():
             raise click.ClickException(
-                f"there is no display here to open Rerun on: write a file, fleet replay {session} --save out.rrd"
+                "there is no display here to open Rerun on: write a file, "
+                f"fleet replay {typed_name(found)} --save out.rrd"
             )
         part = _part(found, cars, start, end)
         with tempfile.TemporaryDirectory() as scratch:

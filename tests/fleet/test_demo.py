@@ -1,6 +1,7 @@
 """`fleet demo` as a user runs it: all its checks pass, and after Ctrl-C no process is left."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -51,6 +52,18 @@ def test_terminated_demo_stops_cars_and_leaves_nothing(tmp_path: Path) -> None:
         assert found, "it came to the coordinator"
         assert demo.wait(PATIENCE_S) == 130
     wait_for(lambda: not _left(str(tmp_path)), "everything has ended")
+
+
+@pytest.mark.timeout(PATIENCE_S + 60)
+def test_nobody_reads_it_and_no_directory_is_blamed(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "fleet.cli", "demo", "--no-view", "--sessions", str(tmp_path)]
+    nobody, stdout = os.pipe()
+    os.close(nobody)
+    with subprocess.Popen(command, stdout=stdout, stderr=subprocess.PIPE, text=True) as demo:
+        os.close(stdout)
+        _, errors = demo.communicate(timeout=PATIENCE_S)
+    assert (demo.returncode, errors) == (1, "")
+    assert _left(str(tmp_path)) == []
 
 
 def test_directory_that_cannot_be_made_is_one_line() -> None:

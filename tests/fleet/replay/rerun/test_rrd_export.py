@@ -220,13 +220,16 @@ def test_bad_input_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert "no session" in missing.stderr, "what is missing comes before a missing display"
 
 
-def test_without_a_display_a_file_is_proposed(made: tuple[Path, Counter[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_a_file_is_proposed(
+    made: tuple[Path, Counter[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    result = CliRunner().invoke(replay, [str(made[0])])
+    session = Path(shutil.copy(made[0], tmp_path / "my session.mcap"))
+    result = CliRunner().invoke(replay, [str(session)])
     assert result.exit_code == 1
-    assert "--save out.rrd" in result.stderr
+    assert f"fleet replay '{session}' --save out.rrd" in result.stderr, "it can be typed as it is"
 
 
 @pytest.mark.parametrize("size", [8, 9, 20, 30, 200, 1000])
