@@ -20,7 +20,7 @@ TWINS = frozenset({"Fleet", "Car", "Lease", "Watch"})
 POSIX = frozenset({"fcntl", "grp", "pty", "pwd", "readline", "resource", "syslog", "termios", "tty"})
 """Modules of the standard library that exist on POSIX systems only."""
 
-LAZY_IMPORTS = 142
+LAZY_IMPORTS = 143
 """Maximum number of imports inside functions. Each of them shortens the start of a command line."""
 
 

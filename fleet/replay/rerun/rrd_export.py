@@ -7,6 +7,8 @@ drawings.py add what the viewer draws.
 import re
 import shutil
 import tempfile
+import threading
+import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -39,6 +41,9 @@ it."""
 _BAD_FIELD: Final = re.compile(rf"Lenses error: .* input: `([\w.]+){MESSAGE_SUFFIX}`")
 """Found in Rerun's error for a field that is drawn, but has another type in a file."""
 _INTERRUPT: Final = re.compile(rf"\b{KeyboardInterrupt.__name__}\b")
+_CLOSING_POLL_S: Final = 0.05
+STALLED_S: Final = 30.0
+"""Time without a byte in the file after which the writer counts as stopped. A slow disk takes a few seconds."""
 _TOPIC: Final = "McapChannel:topic"
 _LOGS: Final = tuple(f"/{topic.name}" for topic in TOPICS.values() if topic.message == "foxglove.Log")
 
@@ -180,12 +185,12 @@ def _write(
         if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun turns the exception into text
             raise KeyboardInterrupt from None
         if refused := _BAD_SCHEMA.search(words) or _BAD_FIELD.search(words):
-            recording.disconnect()
+            _is_closed(recording, rrd)
             raise _SchemaRefused(refused[1]) from None
         raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
     replayed, missed = tally.compare(prepared)
     if missed and not final:
-        recording.disconnect()
+        _is_closed(recording, rrd)
         return None
     _name_missed(session, part, missed, replayed.left_out)
     contents = drawing.contents()
@@ -196,17 +201,38 @@ def _write(
     marks = drawing.added_marks(description.marks if description is not None else (), part.start_ns, part.end_ns)
     recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), marks, drawing.static())))
     recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
-    recording.disconnect()
-    try:
-        # Rerun's writer does not report a full disk. So read the file back: if it is truncated, it has no index.
-        with warnings.catch_warnings(action="ignore"):
-            rrc.RrdReader(rrd).store()
-    except (RuntimeError, ValueError):
+    if not (_is_closed(recording, rrd) and _is_whole(rrd)):
         free = shutil.disk_usage(rrd.parent).free
         raise ExportFailed(
             f"{out} is incomplete: the disk is probably full ({free} bytes are free). Name another place."
-        ) from None
+        )
     return replayed
+
+
+def _is_closed(recording: rr.RecordingStream, rrd: Path) -> bool:
+    """Write all that is left, and close the file. Return False if Rerun's writer has stopped before the end."""
+    # After an error, as on a full disk, Rerun's writer ends. Now and then, `disconnect` then waits for it for ever.
+    closing = threading.Thread(target=recording.disconnect, name="rrd-close", daemon=True)
+    closing.start()
+    size, grown_at = -1, time.monotonic()
+    while closing.is_alive():
+        closing.join(_CLOSING_POLL_S)
+        if (now_size := rrd.stat().st_size) != size:
+            size, grown_at = now_size, time.monotonic()
+        elif time.monotonic() - grown_at > STALLED_S:
+            rr.unregister_shutdown()  # at the end of this process, it would wait for this recording, too
+            return False
+    return True
+
+
+def _is_whole(rrd: Path) -> bool:
+    """Return False if the file lacks its end. Rerun's writer does not report a full disk."""
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            rrc.RrdReader(rrd).store()
+    except (RuntimeError, ValueError):  # a file without its end has no index
+        return False
+    return True
 
 
 def _name_missed(session: Session, part: Part, missed: Counter[str], left_out: LeftOut) -> None:
