@@ -90,9 +90,9 @@ def mode(client: Fleet, cars: tuple[str, ...], mode: str, *, take: bool, as_json
 
 
 def _ask_until_ctrl_c(
-    client: Fleet, request: CommandRequest, end: CommandRequest, cars: Sequence[str] | None, *, as_json: bool
+    client: Fleet, request: CommandRequest, end: CommandRequest, cars: Sequence[str], *, as_json: bool
 ) -> Never:
-    """Send a command to these cars, or to all, and wait for its end. After Ctrl-C or SIGTERM, send them `end`."""
+    """Send a command to these cars, and wait for its end. After Ctrl-C or SIGTERM, send them `end`."""
     with signals.sigterm_interrupts():
         try:
             outcomes = client.ask(request, cars)

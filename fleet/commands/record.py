@@ -194,7 +194,7 @@ def run(
             recorder = Recorder(bus, fleet, place, options, site=site, pins=pins, people=people, notify=_warn)
             session = _start(recorder, place)
             try:
-                _say_begun(as_json, fleet, session, recorder.full)
+                _say_begun(fleet, session, recorder.full, as_json=as_json)
                 _wait(bus, stop, recorder.ended, parent)
             finally:  # or its threads would keep this process for ever, if nobody reads what it says
                 outcome = recorder.close()
@@ -229,7 +229,7 @@ def _start(recorder: "Recorder", place: Path) -> Path:
         ) from None
 
 
-def _say_begun(as_json: bool, fleet: str, session: Path, full: str) -> None:  # noqa: FBT001 - the flag of the command
+def _say_begun(fleet: str, session: Path, full: str, *, as_json: bool) -> None:
     if full:
         values = {"session": str(session), "state": RecorderState.FULL}
         _say(as_json, values, f"{keys.describe_fleet(fleet)} is not recorded until there is room: {full}")

@@ -175,6 +175,10 @@ class CarSnapshot(Struct, frozen=True):
         """Return True if the car was commanded into this mode last, and its readings do not contradict it."""
         return self.mode == mode and self.verdict != Verdict.CONTRADICTED
 
+    def is_confirmed_in(self, mode: str) -> bool:
+        """Return True if the car was commanded into this mode last, and its readings confirm it."""
+        return self.mode == mode and self.verdict == Verdict.CONFIRMED
+
     def lacks(self, mode: str) -> bool:
         """Return True if the car's platform does not know this mode, or the fleet file forbids it."""
         profile = self.profile

@@ -68,7 +68,9 @@ def note_failures(
     found = {
         (car, mode): at
         for (car, mode), at in failed_modes.items()
-        if now - at < FAILED_MODE_KEPT_S and car not in alone and not _is_surely_in(snapshot, car, mode)
+        if now - at < FAILED_MODE_KEPT_S
+        and car not in alone
+        and not snapshot.cars.get(car, UNKNOWN_CAR).is_confirmed_in(mode)
     }
     for car, each in attempts.items():
         known = snapshot.cars.get(car, UNKNOWN_CAR)
@@ -76,11 +78,6 @@ def note_failures(
         if is_contradicted and each.failed(now, busy=known.busy) >= ATTEMPTS_BEFORE_REPLACEMENT:
             found[car, each.mode] = now
     return found
-
-
-def _is_surely_in(snapshot: FleetSnapshot, car: str, mode: str) -> bool:
-    known = snapshot.cars.get(car, UNKNOWN_CAR)
-    return known.mode == mode and known.verdict == Verdict.CONFIRMED
 
 
 class HeldRole(Struct, frozen=True):

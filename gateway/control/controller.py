@@ -463,8 +463,7 @@ class Controller(Generic[D_co]):
         self._queue.held = HeldMotion(drive.motion, pending, *self._drive_times(pending, drive.duration_s, now))
         if held is not None and held.motion is drive.motion and held.pending.sent:
             self._queue.held.begin(now, self.driver.model.range_cm)
-            self._log.record_sent(pending, now, "the running drive was extended")
-            return Answer(Phase.SENT, words="the running drive was extended")
+            return self._took_over(pending, "extended", now)
         self.driver.resume_motion(words, now)
         return self._queued(pending, now, self._describe_wait(pending, now))
 
@@ -523,6 +522,10 @@ class Controller(Generic[D_co]):
         words = f"sent for {sent_s:.1f} s until now; a newer command has {changed} the drive"
         self._log.record(held.pending, Phase.SENT, now, words=words, basis=Basis.SENT)
         held.pending = pending
+        return self._took_over(pending, changed, now)
+
+    def _took_over(self, pending: Pending, changed: str, now: float) -> Answer:
+        """Answer a drive that holds the running motion from now on, without a frame of its own."""
         words = f"the running drive was {changed}"
         self._log.record_sent(pending, now, words)
         return Answer(Phase.SENT, words=words)

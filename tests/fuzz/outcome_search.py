@@ -160,12 +160,11 @@ class FirstFamily:
 class SecondFamily:
     """A car of the second family."""
 
-    def __init__(self, seed: int, moments: random.Random) -> None:
+    def __init__(self, seed: int) -> None:
         self.episode = UgvEpisode(seed)
         self.about = f"{self.episode.car_platform}, {sorted(self.episode.options)}"
         self.control = self.episode.control
         self.records = self.episode.records
-        self._moments = moments
 
     @property
     def linked(self) -> bool:
@@ -207,7 +206,7 @@ class Outcomes:
 
     def __init__(self, seed: int) -> None:
         moments = self._moments = random.Random(f"outcome {seed}")
-        self.played: PlayedCar = SecondFamily(seed, moments) if seed % 5 == 4 else FirstFamily(seed, moments)
+        self.played: PlayedCar = SecondFamily(seed) if seed % 5 == 4 else FirstFamily(seed, moments)
         self.report = OutcomeReport(seed, self.played.about)
         self.people = [f"p{number}" for number in range(moments.choice([1, 1, 2, 3]))]
         self._kinds = dict(zip(self.people, ("person", "person", "script"), strict=False))

@@ -34,7 +34,7 @@ class ResumePoint(Struct, frozen=True):
     known: frozenset[tuple[str, int, int]] = frozenset()
     """Messages recorded since then: key, sequence, identity (message_identity.py)."""
     clocks: PublisherClocks = field(default_factory=PublisherClocks)
-    """What these messages show of the publishers' clocks."""
+    """The publishers' clocks, as far as these messages show them."""
 
 
 def find_interrupted(root: Path, fleet: str, now_ns: int) -> ResumePoint:

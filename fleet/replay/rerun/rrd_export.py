@@ -185,12 +185,12 @@ def _write(
         if _INTERRUPT.search(words):  # Ctrl-C during a lens: Rerun turns the exception into text
             raise KeyboardInterrupt from None
         if refused := _BAD_SCHEMA.search(words) or _BAD_FIELD.search(words):
-            _is_closed(recording, rrd)
+            _close(recording, rrd)
             raise _SchemaRefused(refused[1]) from None
         raise ExportFailed(f"Rerun cannot read {session.path}: {words[:200]}") from None
     replayed, missed = tally.compare(prepared)
     if missed and not final:
-        _is_closed(recording, rrd)
+        _close(recording, rrd)
         return None
     _name_missed(session, part, missed, replayed.left_out)
     contents = drawing.contents()
@@ -201,7 +201,7 @@ def _write(
     marks = drawing.added_marks(description.marks if description is not None else (), part.start_ns, part.end_ns)
     recording.send_chunks(rrc.LazyChunkStream.from_iter(chain(drawing.ends(), marks, drawing.static())))
     recording.send_blueprint(blueprint.layout(drawing, tab), make_active=False, make_default=True)
-    if not (_is_closed(recording, rrd) and _is_whole(rrd)):
+    if not (_close(recording, rrd) and _is_whole(rrd)):
         free = shutil.disk_usage(rrd.parent).free
         raise ExportFailed(
             f"{out} is incomplete: the disk is probably full ({free} bytes are free). Name another place."
@@ -209,7 +209,7 @@ def _write(
     return replayed
 
 
-def _is_closed(recording: rr.RecordingStream, rrd: Path) -> bool:
+def _close(recording: rr.RecordingStream, rrd: Path) -> bool:
     """Write all that is left, and close the file. Return False if Rerun's writer has stopped before the end."""
     # After an error, as on a full disk, Rerun's writer ends. Now and then, `disconnect` then waits for it for ever.
     closing = threading.Thread(target=recording.disconnect, name="rrd-close", daemon=True)

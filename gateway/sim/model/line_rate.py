@@ -1,4 +1,4 @@
-"""What a UART reads from a line on which the other end sends at another baud rate. Pure."""
+"""Bytes that a UART misreads, because the other end of the line sends at another baud rate. Pure."""
 
 from math import ceil
 

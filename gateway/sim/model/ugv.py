@@ -78,7 +78,7 @@ reading file: [boot] starts:
 {"name":"boot","intro":"these cmds run automatically at boot."}
 %s^^^ ^^^ ^^^ reading file: boot.mission ends. ^^^ ^^^ ^^^
 """
-"""What the program prints of its boot mission, with a line for each step."""
+"""The text of the boot mission, which the program prints with a line for each step."""
 UART_S: Final = 0.3
 """Time from a reset until the program has opened its UART. Bytes that arrive before that are lost."""
 

@@ -159,7 +159,7 @@ class StopEvidence(Struct):
     changed_expectation: bool = False
     """True if the last reading showed that this car cannot show a stop after all, or has another rhythm than before."""
 
-    # What arrived last.
+    # The last arrivals.
     _last_at: float = _NEVER
     """When the last bytes arrived, except text, echoes, and frames of the options (arm, gyro)."""
     _foreign_at: float = _NEVER
@@ -171,7 +171,7 @@ class StopEvidence(Struct):
     _ended_with_echo: bool = False
     """True if the last bytes were a report with an echo, also if it arrived too early to count."""
 
-    # What was written since the last report.
+    # The frames since the last report.
     _blocks: list[_Block] = field(default_factory=list)
     """The other frames that block, written since the last report."""
     _other_frame_written: bool = False
@@ -187,7 +187,7 @@ class StopEvidence(Struct):
     _older_reports_s: float = 0.0
     """Time after `MODE00` for which reports may arrive that the car sent before it. 0 until a stop is tried again."""
 
-    # What the reports of this stop have shown.
+    # The findings of this stop.
     _block_gaps: int = 0
     _gaps_needed: int = BLOCK_GAPS
     _controlled: bool = False

@@ -117,7 +117,7 @@ class StopInProgress(Struct):
     overdue: bool = False
     """True if the car did not show the stop in time. The gateway continues to send it."""
 
-    # What it is for.
+    # The reason for it.
     mode_command: Pending | None = None
     """The mode command for which this stop is sent first."""
     repeats: bool = False
