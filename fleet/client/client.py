@@ -479,7 +479,7 @@ class Fleet:
             command.inbox.put((time.monotonic(), SupervisedCars(frozenset(names), frozenset(self.cars()))))
 
     def _on_gateway(self, token: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
-        """Handle a change of a gateway's presence. Runs on a Zenoh thread."""
+        """Handle a change of a gateway's presence. Runs on a thread of the bus."""
         car = token.rpartition("/")[2]
         for command in list(self._pending.values()):
             if command.concerns(car):

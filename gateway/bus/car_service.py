@@ -185,9 +185,9 @@ class CarService:
             self._stream(request)
 
     def _on_sender(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
-        """Queue a change of a sender's token. Runs on a Zenoh thread."""
+        """Queue a change of a sender's token. Runs on a thread of the bus."""
         self._senders(key.rpartition("/")[2], alive)
 
     def _on_car(self, key: str, alive: bool) -> None:  # noqa: FBT001 - watch_tokens calls it so
-        """Queue a change of a gateway's token. Runs on a Zenoh thread."""
+        """Queue a change of a gateway's token. Runs on a thread of the bus."""
         self._cars(key.rpartition("/")[2], alive)

@@ -7,11 +7,14 @@ connected. A watch reports which tokens appear and disappear.
 import atexit
 import itertools
 import os
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from math import inf
+from queue import SimpleQueue
 from time import monotonic
 from typing import Any, Final, Self
 
@@ -95,6 +98,9 @@ class Bus:
         """Threads of Zenoh that run our callbacks."""
         self._alive: dict[str, set[str]] = {}
         """Existing tokens by watched expression."""
+        self._token_news: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        """Calls of the callbacks of watches, in the order of the tokens. None ends the thread that makes them."""
+        self._token_reporter: threading.Thread | None = None
         self._answered_over = ""
         """The link over which a question for tokens was answered before, so that the next answer over it is whole.
         Empty while tokens of a watch may still be on their way."""
@@ -189,7 +195,9 @@ class Bus:
             self._declarations.clear()
             self._session.close()  # type: ignore[no-untyped-call]  # zenoh's stub has no return type
             # A daemon thread that is still in Zenoh's code when the interpreter ends would abort the process.
-            for thread in self._threads - {threading.current_thread()}:
+            self._token_news.put(None)
+            threads = self._threads if self._token_reporter is None else {*self._threads, self._token_reporter}
+            for thread in threads - {threading.current_thread()}:
                 thread.join(_THREAD_END_TIMEOUT_S)
 
     def _close_at_exit(self) -> None:
@@ -419,16 +427,16 @@ class Bus:
             with self._lock:
                 if expression in self._alive and link in ("", answered_over):
                     return sorted(self._alive[expression])
-                is_watching = bool(self._alive)
-                watched = {
-                    key for each in self._alive.values() for key in each if wanted.intersects(zenoh.KeyExpr(key))
-                }
             if not link and monotonic() < link_end:
                 self._closing.wait(_LINK_POLL_S)
                 continue
             with self.while_open():
                 replies = self._session.liveliness().get(expression, timeout=max(end - asked_at, _LINK_POLL_S))
-            found = watched | {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+            found = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+            with self._lock:
+                is_watching = bool(self._alive)
+                watched = {key for each in self._alive.values() for key in each}
+            found |= {key for key in watched if wanted.intersects(zenoh.KeyExpr(key))}
             self._answered_over = link
             now = monotonic()
             is_prompt = now - asked_at < _PROMPT_S
@@ -439,7 +447,7 @@ class Bus:
                 self._closing.wait(_END_OF_LINK_S)
 
     def watch_tokens(self, expression: str, callback: Callable[[str, bool], object]) -> None:
-        """Call back with (key, alive) for every existing token and every change, on a Zenoh thread."""
+        """Call back with (key, alive) for every existing token and every change, on a thread of this bus."""
         awaited = set(self.tokens(expression))
         alive: set[str] = set()
         complete = threading.Event()
@@ -456,18 +464,36 @@ class Bus:
                     else:
                         alive.discard(key)
                     awaited.discard(key)
-                if not is_twin:
-                    callback(key, came)
-                if not awaited:
-                    complete.set()
+                    if not is_twin:
+                        self._token_news.put(partial(callback, key, came))
+                    if not awaited:
+                        self._token_news.put(complete.set)
 
-            return session.liveliness().declare_subscriber(expression, on_token, history=True)
+            # Zenoh's own thread for a callback may be late on a busy machine: then an answer over a new link came
+            # earlier than the tokens before it. Called at once, `on_token` has run when a later answer arrives.
+            at_once = zenoh.handlers.Callback(on_token, indirect=False)
+            return session.liveliness().declare_subscriber(expression, at_once, history=True)
 
+        self._start_to_report_tokens()
         self._declare(declare)
         if awaited and not complete.wait(_TOKEN_HISTORY_TIMEOUT_S):
             self._answered_over = ""
         with self._lock:
             self._alive[expression] = alive
+
+    def _start_to_report_tokens(self) -> None:
+        """Start the thread that calls back for all watches, unless it runs."""
+        with self._lock:
+            if self._token_reporter is None:
+                self._token_reporter = threading.Thread(target=self._report_tokens, name="bus-tokens", daemon=True)
+                self._token_reporter.start()
+
+    def _report_tokens(self) -> None:
+        while (report := self._token_news.get()) is not None:
+            try:
+                report()
+            except Exception:  # noqa: BLE001 - one callback's error must not end the others
+                threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), self._token_reporter)))
 
     def query(
         self,

@@ -156,6 +156,38 @@ def test_tokens_after_a_lost_link(endpoint: str) -> None:
         assert watcher.tokens("fleet/*") == ["fleet/red"]
 
 
+def test_tokens_do_not_wait_for_callbacks(endpoint: str) -> None:
+    """On a busy machine, a callback ran after the answer over a new link. Then that answer lacked watched tokens."""
+    proxy = TcpProxy(int(endpoint.rpartition(":")[2]))
+    busy, called = threading.Event(), threading.Event()
+    with watcher_behind(proxy, endpoint) as watcher:
+        watcher.watch_tokens("two/*", lambda key, alive: called.set() if alive else busy.wait(processes.PATIENCE_S))
+        called.clear()
+        before = listed_link(watcher)
+        proxy.hang_up()
+        wait_for(lambda: listed_link(watcher) not in ("", before))
+        assert watcher.tokens("*/*") == THERE
+        assert watcher.tokens("two/*") == ["two/red"]
+        assert not called.is_set()
+        busy.set()
+        wait_for(called.is_set)
+
+
+def test_error_of_a_callback_ends_no_other_watch(endpoint: str) -> None:
+    hook, errors, seen = threading.excepthook, [], list[str]()
+    threading.excepthook = lambda failed: errors.append(failed.exc_type)
+    try:
+        with bus.Bus.open(endpoint) as car, bus.Bus.open(endpoint) as watcher:
+            watcher.watch_tokens("fleet/*", lambda key, alive: 1 // 0)
+            watcher.watch_tokens("two/*", lambda key, alive: seen.append(key))
+            car.token("fleet/red")
+            car.token("two/red")
+            wait_for(lambda: seen == ["two/red"])
+            wait_for(lambda: errors == [ZeroDivisionError])
+    finally:
+        threading.excepthook = hook
+
+
 def listed_link(opened: bus.Bus) -> str:
     return next((str(link.src) for link in opened._session.info.links()), "")
 
