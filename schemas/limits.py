@@ -23,6 +23,8 @@ STREAM_SILENCE_S: Final = 0.5
 once."""
 SHUTDOWN_S: Final = 16.0
 """Maximum time that a gateway that shuts down waits for its car to show the stop."""
+MAX_NAME_LENGTH: Final = 128
+"""Maximum characters of a sender's name, or of a command's id."""
 MAX_REASON_LENGTH: Final = 200
 """Maximum characters of an e-stop's reason. The gateway cuts off the rest: a long reason must not make an e-stop
 fail."""

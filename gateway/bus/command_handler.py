@@ -14,7 +14,7 @@ from gateway.bus import command_parser
 from gateway.bus.car_publisher import CarPublisher
 from gateway.bus.car_service import Request
 from gateway.bus.estop_sync import EstopSync
-from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
+from gateway.control.commands import Answer, Command
 from gateway.control.control_output import CommandRecord, LogRecord
 from gateway.control.controller import Controller
 from gateway.control.driver import Driver
@@ -22,7 +22,7 @@ from gateway.control.safety_state import PersistedSafety
 from schemas import bus, keys, topics
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.process import json_log
-from schemas.words import Level, Phase, Reason
+from schemas.words import Level, Phase
 
 SAVE_RETRY_S: Final = 1.0
 """Interval at which a safety state that could not be saved is tried again: the disk may have room again."""
@@ -84,24 +84,10 @@ class CommandHandler:
         before = self._control.safety.persisted
         command, answer = self._carry_out(request)
         if request.query is not None:
-            if isinstance(command.what, EmergencyStop | Resume | Pause | Unpause):
-                self._share(request, command, answer, before)
+            now = self._control.safety.persisted
+            self._estop_sync.share(command, answer, before, now, by_wildcard=request.by_wildcard)
             self._unanswered.append((request, command.id, answer))
         self._wake()
-
-    def _share(self, request: Request, command: Command, answer: Answer, before: PersistedSafety) -> None:
-        """Forward a command that concerns the whole fleet to the other gateways.
-
-        If its sender has addressed them too, by a wildcard, query them instead.
-        """
-        if not request.by_wildcard:
-            self._estop_sync.forward(command, before, self._control.safety.persisted)
-        elif (
-            isinstance(command.what, Pause | Unpause)
-            or (isinstance(command.what, EmergencyStop) and command.what.fleet_wide)
-            or (isinstance(command.what, Resume) and answer.reason is Reason.ESTOPPED)
-        ):
-            self._estop_sync.sync_soon()  # this gateway may have missed an e-stop, a pause, or the end of one
 
     def _carry_out(self, request: Request) -> tuple[Command, Answer]:
         """Parse a request and pass it to control. Publish the original request in the command's first record."""

@@ -33,11 +33,12 @@ from gateway.control.commands import (
     SetMode,
     Signal,
     Stop,
+    Unpause,
 )
 from schemas import messages
 from schemas.commands import COMMANDS, STOPS, Verb
 from schemas.identity import speaks_for
-from schemas.limits import DEFAULT_MAX_DRIVE_S, MAX_REASON_LENGTH
+from schemas.limits import DEFAULT_MAX_DRIVE_S, MAX_NAME_LENGTH, MAX_REASON_LENGTH
 from schemas.process.stdio import printable
 from schemas.rights import Sender
 from schemas.suggestion import did_you_mean
@@ -52,8 +53,6 @@ ARM_JOINTS: Final = 6
 """Maximum of a color, maximum of an angle in degrees, number of joints (docs/reference/keys.md#command-keys)."""
 DEFAULT_DRIVE_S: Final = 0.5
 """Duration of a drive that names none, unless the car may only be driven for less."""
-MAX_NAME_LENGTH: Final = 128
-"""Maximum characters of a sender's name or an id."""
 _SAME_QUERY_NS: Final = 2_000_000_000
 """Length of the periods of the wall clock in which equal e-stops count as one query (see `_id`)."""
 _WIRE_KINDS: Final = tuple(kind for kind in Rank if kind is not Rank.LEAD)
@@ -323,6 +322,7 @@ _WHAT: Final[dict[str, Callable[[Any], Action]]] = {
     Verb.ESTOP: _estop,
     Verb.RESUME: _resume,
     Verb.PAUSE: lambda message: Pause(_why(message.why)),
+    Verb.UNPAUSE: lambda message: Unpause(tuple(message.ids)),
     Verb.LEND: _lend,
 }
 """Functions that make the action of a verb whose fields need rules. `drive` is not here: it also needs a limit."""

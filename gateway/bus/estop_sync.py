@@ -11,15 +11,15 @@ import random
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Any, Final
 
-from gateway.bus.command_parser import MAX_NAME_LENGTH
-from gateway.control.commands import Command, EmergencyStop, Pause, Resume, Unpause
+from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
 from gateway.control.safety_state import PersistedSafety
 from schemas import bus, keys, messages
 from schemas.backoff import backoff_s
 from schemas.commands import COMMANDS
 from schemas.gen import fleet_v1_pb2 as pb
+from schemas.limits import MAX_NAME_LENGTH
 from schemas.rights import estops_of, pauses_of
-from schemas.words import Scope
+from schemas.words import Reason, Scope
 
 BATCH_DELAY_S: Final = 0.2
 """Delay before a query, so that gateways that start together are queried together."""
@@ -35,6 +35,9 @@ MAX_RETRY_S: Final = 10.0
 SYNC_QUERY_TIMEOUT_S: Final = 2.5
 """Time for the answers to one query. When two sites are linked again, all their gateways query each other, which fills
 the link. With a timeout of 1 s and 5 % of the packets lost, an e-stop needed 2 to 17 s from one site to the other."""
+ROUND_S: Final = 5.0
+"""Mean interval at which one of the other gateways, drawn at random, is queried. A command to all cars may miss one
+that is starting, and be too old for one that hangs. So every gateway learns in the end what any of them knows."""
 MAX_SINGLE_QUERIES: Final = 8
 """Number of gateways that may always be queried one by one, whatever their share of the fleet is."""
 MAX_SINGLE_SHARE: Final = 0.5
@@ -49,6 +52,46 @@ log = logging.getLogger("gateway")
 
 MergeSafety = Callable[[PersistedSafety, str], object]
 """Called with the e-stops and pauses, in force and ended, and the car whose gateway has sent them."""
+
+
+Copy = pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand
+
+
+def copy_for_others(command: Command, car: str, before: PersistedSafety, now: PersistedSafety) -> Copy | None:
+    """Return the command for all other gateways after one to `car` alone. None if it does not concern them.
+
+    `before` and `now`: the state of this car before and after the command.
+    """
+    fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
+    copy: Copy
+    match command.what:
+        case EmergencyStop(why, True):
+            copy = pb.EstopCommand(why=why, scope=Scope.FLEET)
+        case Resume() if ended_ids := sorted(fleet_wide & set(now.ended)):
+            copy = pb.ResumeCommand(ids=ended_ids)
+        case Pause(why) if now.pauses != before.pauses:
+            copy = pb.PauseCommand(why=why)
+        case Unpause() if now.pauses != before.pauses:
+            copy = pb.UnpauseCommand(ids=[each.id for each in before.pauses if each not in now.pauses])
+        case _:
+            return None
+    copy.sender, copy.kind, copy.id = command.sender.name, command.sender.kind, command.id
+    if isinstance(command.what, Resume | Unpause):
+        # A car may get both this copy and the command of the sender. With one id for both, the second would be refused
+        # as a duplicate.
+        copy.id = f"{command.id}-{car}"[-MAX_NAME_LENGTH:]
+    return copy
+
+
+def concerns_fleet(command: Command, answer: Answer) -> bool:
+    """Return True for a command to all gateways after which one of them may lack, or still have, what others know."""
+    match command.what:
+        case Pause() | Unpause() | EmergencyStop(fleet_wide=True):
+            return True
+        case Resume():
+            return answer.reason is Reason.ESTOPPED
+        case _:
+            return False
 
 
 class EstopSync:
@@ -82,32 +125,23 @@ class EstopSync:
         self._due |= self._alive
         self._changed.set()
 
-    def forward(self, command: Command, before: PersistedSafety, now: PersistedSafety) -> None:
-        """Send a fleet-wide e-stop, a pause, or the end of one to all gateways.
+    def share(
+        self, command: Command, answer: Answer, before: PersistedSafety, now: PersistedSafety, *, by_wildcard: bool
+    ) -> None:
+        """Let the other gateways know what a command has changed for the whole fleet.
 
-        Call it only for a command that came to this car alone, so that the other gateways do not know it.
+        `by_wildcard`: its sender has addressed them, too.
         """
-        fleet_wide = {estop.id for estop in before.estops if estop.fleet_wide}
-        payload: pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand
-        match command.what:
-            case EmergencyStop(why, True):
-                payload = pb.EstopCommand(why=why, scope=Scope.FLEET)
-            case Resume() if ended_ids := sorted(fleet_wide & set(now.ended)):
-                payload = pb.ResumeCommand(ids=ended_ids)
-            case Pause(why) if now.pauses != before.pauses:
-                payload = pb.PauseCommand(why=why)
-            case Unpause() if now.pauses != before.pauses:
-                payload = pb.UnpauseCommand()
-            case _:
-                return
-        payload.sender, payload.kind, payload.id = command.sender.name, command.sender.kind, command.id
-        if isinstance(command.what, Resume | Unpause):
-            # A car may get both this copy and the command of the sender. With one id for both, the second would be
-            # refused as a duplicate.
-            payload.id = f"{command.id}-{self._car}"[-MAX_NAME_LENGTH:]
+        if by_wildcard:
+            if concerns_fleet(command, answer):
+                self.sync_soon()
+            return
+        copy = copy_for_others(command, self._car, before, now)
+        if copy is None:
+            return
         key = keys.command_key(self._fleet, "*", command.verb, self._bus.identity)
         encoding = messages.encoding_of(COMMANDS[command.verb].message)
-        task = asyncio.ensure_future(asyncio.to_thread(self._send_to_all, key, payload.SerializeToString(), encoding))
+        task = asyncio.ensure_future(asyncio.to_thread(self._send_to_all, key, copy.SerializeToString(), encoding))
         self._forwarding.add(task)
         task.add_done_callback(self._forwarding.discard)
 
@@ -123,12 +157,11 @@ class EstopSync:
         retry: asyncio.TimerHandle | None = None
         batches, silences, first = 0, 0, True
         while True:
-            try:
-                async with asyncio.timeout(BATCH_RESET_S):
-                    await self._changed.wait()
-            except TimeoutError:
+            if not await self._is_changed_within(BATCH_RESET_S):
                 batches = 0
-                await self._changed.wait()
+                if not await self._is_changed_within(2.0 * ROUND_S * random.random()):  # noqa: S311 - no secret
+                    self._due |= set(random.sample(sorted(self._alive), min(1, len(self._alive))))
+                    self._changed.set()
             batches += 1
             await asyncio.sleep(backoff_s(batches, BATCH_DELAY_S, MAX_BATCH_DELAY_S))
             if self._queries_all() and not first:
@@ -146,6 +179,13 @@ class EstopSync:
             if self._due:
                 delay_s = backoff_s(silences, FIRST_RETRY_S, MAX_RETRY_S)
                 retry = asyncio.get_running_loop().call_later(delay_s, self._changed.set)
+
+    async def _is_changed_within(self, seconds: float) -> bool:
+        """Return True as soon as there is a gateway to query, or False after this time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._changed.wait()
+        return self._changed.is_set()
 
     def _queries_all(self) -> bool:
         """Return True if so many gateways are due that one query to all is cheaper."""

@@ -120,7 +120,9 @@ class Pause(Struct, frozen=True):
 
 
 class Unpause(Struct, frozen=True):
-    """End the pause of the fleet. By itself this moves no car."""
+    """End the pauses of the fleet with these ids, or without ids all that are in force. By itself this moves no car."""
+
+    ids: tuple[str, ...] = ()
 
 
 class Lend(Struct, frozen=True):
@@ -150,7 +152,6 @@ Action = (
 
 PLAIN_ACTIONS: Final[Mapping[str, type[Action]]] = {
     Verb.STOP: Stop,
-    Verb.UNPAUSE: Unpause,
     Verb.LEASE: TakeLease,
     Verb.FIND: Find,
 }

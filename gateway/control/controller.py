@@ -205,8 +205,8 @@ class Controller(Generic[D_co]):
                 return self._set_mode(pending, mode, now)
             case Resume():
                 return self._resume(pending, what, now)
-            case Unpause():
-                return self._unpause(pending, now)
+            case Unpause(ids):
+                return self._unpause(pending, ids, now)
             case Lend():
                 return self._lend(pending, what, now)
             case EndLoan():
@@ -361,9 +361,9 @@ class Controller(Generic[D_co]):
             return "this pause has ended already, so the car only stops"
         return "the pause lasts until `fleet unpause`"
 
-    def _unpause(self, pending: Pending, now: float) -> Answer:
+    def _unpause(self, pending: Pending, ids: tuple[str, ...], now: float) -> Answer:
         by = pending.command.sender.name
-        if not self.safety.end_pauses(each.id for each in self.safety.pauses):
+        if not self.safety.end_pauses(ids or [each.id for each in self.safety.pauses]):
             return self._done(pending, "was not paused", now)
         self._log.log(Level.INFO, "unpaused", f"the pause of {self.car} was ended by {by}", now)
         return self._done(pending, "the pause has ended", now)

@@ -9,6 +9,7 @@ from typing import Final
 from msgspec import Struct, field
 from msgspec.structs import replace
 
+from schemas.limits import MAX_NAME_LENGTH
 from schemas.rights import Estop, FleetPause, Hold, LeaseState, Loan, Sender, strength
 from schemas.words import Rank
 
@@ -106,7 +107,7 @@ class Safety(Struct):
         released.
         """
         if estop.id in self._ended:
-            estop = replace(estop, id=f"{estop.id}.{estop.at_ns:x}")
+            estop = replace(estop, id=f"{estop.id}.{estop.at_ns:x}"[-MAX_NAME_LENGTH:])
         self.put_on_hold(estop.by, estop.at_ns, estop.rank)
         first = self._estops.get(estop.id)
         is_new = first is None or (estop.fleet_wide and not first.fleet_wide)  # new, or from now on for all cars
@@ -127,7 +128,10 @@ class Safety(Struct):
 
     def merge(self, estops: Iterable[Estop], ended: Iterable[str]) -> tuple[list[Estop], list[Estop]]:
         """Merge the fleet-wide e-stops of another gateway. Return (latched, ended). An ended e-stop stays ended."""
-        removed = self.end(each for each in ended if each in self._estops and self._estops[each].fleet_wide)
+        named = list(ended)
+        removed = self.end(each for each in named if each in self._estops and self._estops[each].fleet_wide)
+        # Also unknown ones, because a third gateway may still report them as in force.
+        _remember(self._ended, (each for each in named if each not in self._estops), MAX_ENDED_ESTOPS)
         known = {*self._estops, *self._ended}
         shared = [each for each in estops if each.fleet_wide]
         latched = [self.latch(each) for each in shared if each.id not in known]

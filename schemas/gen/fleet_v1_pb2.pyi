@@ -1211,20 +1211,22 @@ class PauseCommand(_message.Message):
     def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., why: _Optional[str] = ...) -> None: ...
 
 class UnpauseCommand(_message.Message):
-    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s")
+    __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "ids")
     SENDER_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
     ID_FIELD_NUMBER: _ClassVar[int]
     ASKED_FIELD_NUMBER: _ClassVar[int]
     TAKE_FIELD_NUMBER: _ClassVar[int]
     TTL_S_FIELD_NUMBER: _ClassVar[int]
+    IDS_FIELD_NUMBER: _ClassVar[int]
     sender: str
     kind: str
     id: str
     asked: _timestamp_pb2.Timestamp
     take: bool
     ttl_s: float
-    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ...) -> None: ...
+    ids: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, sender: _Optional[str] = ..., kind: _Optional[str] = ..., id: _Optional[str] = ..., asked: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ..., take: _Optional[bool] = ..., ttl_s: _Optional[float] = ..., ids: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class LendCommand(_message.Message):
     __slots__ = ("sender", "kind", "id", "asked", "take", "ttl_s", "to", "duration_s", "end")

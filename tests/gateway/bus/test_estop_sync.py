@@ -131,6 +131,31 @@ async def test_one_that_came_is_asked_and_not_all_others_again(tmp_path: Path) -
         fleet.close()
 
 
+async def test_others_are_asked_again_from_time_to_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command to all cars may have missed one of them, and then no token changes."""
+    monkeypatch.setattr(estop_sync, "BATCH_RESET_S", 0.01)
+    monkeypatch.setattr(estop_sync, "ROUND_S", 0.01)
+    fleet = FleetProcesses(free_endpoint(), tmp_path)
+    learned: list[str] = []
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            reply(query, KEY, pb.Safety(car="blue").SerializeToString(), SAFETY)
+
+    try:
+        with Bus.open(fleet.endpoint, timeout_s=PATIENCE_S) as blue, fleet.bus as opened:
+            blue.queryable(KEY, Handover(asyncio.get_running_loop(), answer))
+            neighbours = EstopSync(opened, "fleet", "red")
+            keeping = asyncio.ensure_future(neighbours.keep_synced(lambda _, told_by: learned.append(told_by)))
+            neighbours.on_tokens({"blue": True})
+            await asyncio.to_thread(wait_for, lambda: len(learned) > 2, "blue is asked again and again")
+            assert {*learned} == {"blue"}
+            keeping.cancel()
+            await asyncio.gather(keeping, return_exceptions=True)
+    finally:
+        fleet.close()
+
+
 async def test_estop_sync_asks_newcomers_one_by_one(tmp_path: Path) -> None:
     """With one query to all gateways, the answers took half of the time in which a hundred gateways start."""
     fleet = FleetProcesses(free_endpoint(), tmp_path)

@@ -273,6 +273,18 @@ def test_pause_stops_like_a_stop_and_only_leads_drive(desk: Workbench) -> None:
     assert [log.code for log in desk.logs] == ["paused", "unpaused", "hold_ended"]
 
 
+def test_unpause_with_ids_ends_only_those(desk: Workbench) -> None:
+    """A gateway names what its unpause has ended, so that the copy ends no pause that somebody begins meanwhile."""
+    desk.ask(Pause("listen"), TEACHER)
+    desk.ask(Pause("lunch"), TEACHER)
+    first, second = desk.control.safety.pauses
+    assert desk.ask(Unpause((first.id, "unknown")), TEACHER).status is Phase.SENT
+    assert desk.control.safety.pauses == (second,)
+    assert {*desk.control.safety.ended_pauses} == {first.id, "unknown"}
+    assert desk.ask(Unpause(), TEACHER).status is Phase.SENT
+    assert desk.control.safety.pauses == ()
+
+
 def test_refused_pause_stops_nothing(desk: Workbench) -> None:
     desk.ask(FORWARD, ANN)
     assert desk.ask(Pause(), BOB).reason is Reason.NOT_ALLOWED

@@ -96,6 +96,15 @@ def test_merge_unites_fleet_wide_estops_and_ended_wins() -> None:
     assert blue.merge((estop("fleet"),), ()) == ([], []), "ended wins over one who has not heard of it"
 
 
+def test_ended_estop_does_not_come_back_through_a_third_gateway() -> None:
+    """Red has ended it, blue has not heard of that, and green hears of the end before it hears of the e-stop."""
+    blue, green = Safety(), Safety()
+    blue.latch(estop("fleet"))
+    assert green.merge((), ("fleet",)) == ([], [])
+    assert green.merge(blue.estops, blue.ended) == ([], [])
+    assert green.estops == ()
+
+
 def test_gateway_without_people_learns_rank_of_estop() -> None:
     """The e-stop of a lead reaches each gateway directly. A gateway without people latches it as a person's."""
     own = estop("a")
