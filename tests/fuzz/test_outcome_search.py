@@ -1,4 +1,4 @@
-"""The search for false, late and missing outcomes, with 50 cars. `make soak` plays 10,000."""
+"""The search for false, late and missing outcomes, with 30 cars. `make soak` plays 10,000."""
 
 import pytest
 
@@ -8,15 +8,15 @@ from gateway.control.controller import Controller
 from schemas.words import Motion
 from tests.fuzz.outcome_search import AFTER_S, CONNECT_S, Outcomes, play
 
-EPISODES = 50
+EPISODES = 30
 
 
-def test_outcomes_of_50_cars_are_true_and_in_time() -> None:
+def test_outcomes_of_30_cars_are_true_and_in_time() -> None:
     episodes = [play(seed) for seed in range(EPISODES)]
     assert {episode.seed: episode.violations for episode in episodes if episode.violations} == {}
     told = sum((episode.outcomes for episode in episodes[1:]), episodes[0].outcomes)
-    assert told.total() > 250
-    assert len(told) > 40, "kinds of outcomes"
+    assert told.total() > 150
+    assert len(told) > 30, "kinds of outcomes"
 
 
 def violations_of_an_extended_drive() -> list[str]:

@@ -1,4 +1,4 @@
-"""The search for needless and missing decisions of a plan, with 80 fleets. `make soak` plays 10,000."""
+"""The search for needless and missing decisions of a plan, with 40 fleets. `make soak` plays 10,000."""
 
 import pytest
 
@@ -6,14 +6,14 @@ from fleet.policy import debounce, state
 from fleet.policy.state import ModeAttempts
 from tests.fuzz.policy_search import play
 
-EPISODES = 80
+EPISODES = 40
 
 
-def test_eighty_fleets_have_no_needless_and_no_missing_decision() -> None:
+def test_forty_fleets_have_no_needless_and_no_missing_decision() -> None:
     episodes = [play(seed) for seed in range(EPISODES)]
     assert {episode.seed: episode.faults for episode in episodes if episode.faults} == {}
-    assert sum(episode.switches for episode in episodes) > 200
-    assert sum(episode.commands for episode in episodes) > 500
+    assert sum(episode.switches for episode in episodes) > 100
+    assert sum(episode.commands for episode in episodes) > 250
 
 
 def test_search_finds_that_a_car_is_replaced_while_it_changes_back(monkeypatch: pytest.MonkeyPatch) -> None:
