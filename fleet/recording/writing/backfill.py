@@ -49,13 +49,15 @@ class Backfill:
         self._lock = threading.Lock()
         self._gaps: dict[str, float] = {}
         """Keys with the time from which messages are missing, s, monotonic."""
+        self._newcomers: set[str] = set()
         self._answers: list[zenoh.Sample] = []
         self._closing = threading.Event()
         self._until = inf
         """When the thread ends at the latest."""
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
-        self._plan = BackfillPlan(now, resume_since=None if resumes_s is None else now - resumes_s)
+        self._begin = now - (resumes_s or 0.0)
+        self._plan = BackfillPlan(now, resume_since=None if resumes_s is None else self._begin)
 
     def start(self) -> None:
         """Start the thread."""
@@ -87,6 +89,11 @@ class Backfill:
                 if _has_cache(key):
                     self._gaps[key] = min(now - age_s, self._gaps.get(key, now))
 
+    def request_newcomers(self, keys: Iterable[str]) -> None:
+        """Request all that the senders of these keys have published during the recording, before they were heard."""
+        with self._lock:
+            self._newcomers.update(filter(_has_cache, keys))
+
     def take_answers(self) -> list[zenoh.Sample]:
         """Return the answers since the last call. Some may be recorded already."""
         with self._lock:
@@ -99,7 +106,7 @@ class Backfill:
         connected_since = waiting_since = polls[0]
         while not self._closing.wait(BACKFILL_POLL_INTERVAL_S):
             now, connected = time.monotonic(), self._bus.link
-            self._plan.add_gaps(self._take_gaps(), polls[0], now)
+            self._plan_missing(polls[0], now)
             # A process that was stopped for longer than a lease has lost its link, even if it has the same one again.
             was_stopped = now - waiting_since > LEASE_POLLS * BACKFILL_POLL_INTERVAL_S
             if connected and (connected != link or was_stopped):
@@ -111,15 +118,17 @@ class Backfill:
             polls.append(now)
             waiting_since = time.monotonic()
         for _ in range(LAST_ROUNDS):
-            self._plan.add_gaps(self._take_gaps(), polls[0], time.monotonic())
+            self._plan_missing(polls[0], time.monotonic())
             self._ask(self._plan.last_queries(), is_last=True)
-            if not self._gaps:  # none was noticed meanwhile
+            if not self._gaps and not self._newcomers:  # none was noticed meanwhile
                 break
 
-    def _take_gaps(self) -> dict[str, float]:
+    def _plan_missing(self, silent_since: float, now: float) -> None:
         with self._lock:
             gaps, self._gaps = self._gaps, {}
-        return gaps
+            newcomers, self._newcomers = self._newcomers, set()
+        self._plan.add_gaps(gaps, silent_since, now)
+        self._plan.add_newcomers(newcomers, self._begin, now)
 
     def _ask(self, queries: Iterable[PlannedQuery], *, is_last: bool = False) -> None:
         """Send these queries. If the recording ends, leave the rest to the last ones, and those when time is up."""

@@ -3,8 +3,9 @@
 When should the recorder ask? After its own link to the hub is back: it asks all. After a gap in the numbers of a
 publisher, which shows that the *car* was cut off: it asks all publishers of this car, because some of them are silent
 for minutes. The command events of this car may have a gap, too. Only the next event would show it, and after the last
-command there is no next event. And the recorder asks shortly after its start. If it continues an interrupted session,
-it asks at once, too, and further back.
+command there is no next event. When a sender is heard for the first time, but not from its first message on, it may
+have published without a link: the recorder asks this car, too, since the begin of the recording. And the recorder asks
+shortly after its start. If it continues an interrupted session, it asks at once, too, and further back.
 
 One query is not enough, because others may reconnect half a second later than we do, and on a loaded machine even
 later. So a reconnect and a gap plan several queries each (`QUERY_AFTER_...`). Their answers overlap, but that does no
@@ -32,6 +33,8 @@ QUERY_AFTER_RECONNECT_S: Final = (0.3, 1.0, 2.0, 4.0)
 """Delays of the queries after a reconnect. Other clients reconnect within half a second, or later on a loaded
 machine."""
 QUERY_AFTER_GAP_S: Final = (0.0, 1.0, 3.0)
+QUERY_AFTER_NEWCOMER_S: Final = (0.0, 1.0)
+"""Delays of the queries after a sender was heard for the first time, but not from its first message on."""
 QUERY_INTERVAL_S: Final = 1.0
 """Minimum time between two first queries of one source. Otherwise, on a network that loses messages all the time, a car
 would be asked for all of its messages five times a second."""
@@ -91,6 +94,16 @@ class BackfillPlan:
         for key in gaps:
             self._asked[source_of(key)].keys.setdefault(key, 0)
 
+    def add_newcomers(self, keys: Collection[str], since: float, now: float) -> None:
+        """Plan queries for keys whose senders have published before they were heard.
+
+        `since`: the begin of the recording.
+        """
+        for source in {source_of(key) for key in keys}:
+            self._plan(source, since - GAP_MARGIN_S, QUERY_AFTER_NEWCOMER_S, now)
+        for key in keys:
+            self._asked[source_of(key)].keys.setdefault(key, 0)
+
     def add_reconnect(self, since: float, now: float) -> None:
         """Plan queries after our own link was lost, which was whole until `since`."""
         self._plan(EVERYTHING, since, QUERY_AFTER_RECONNECT_S, now)
@@ -116,6 +129,8 @@ class BackfillPlan:
         for source in {EVERYTHING, *map(source_of, answered)} if query.source == EVERYTHING else {query.source}:
             asked = self._asked.get(source)
             if asked is None or not (answered or source == EVERYTHING):
+                continue
+            if query.since > asked.unanswered_since:  # a query of all sources that was for younger gaps
                 continue
             asked.keys = {key: count + 1 for key, count in asked.keys.items() if key not in answered}
             if any(count < MAX_ANSWERS_OF_OTHERS for count in asked.keys.values()):

@@ -328,6 +328,9 @@ class Recorder:
                 now_ns = self._now()
                 self._backfill.request({key: (now_ns - before) / 1e9 for key, before in self._session.gaps.items()})
                 self._session.gaps.clear()
+            if self._session.newcomers and has_room:
+                self._backfill.request_newcomers(self._session.newcomers)
+                self._session.newcomers.clear()
         # Do this last, because messages count against the limit until they are written.
         with self._lock:
             self._queued_messages -= len(batch)

@@ -25,6 +25,7 @@ from fleet.recording.sequence_tracker import SequenceTracker, TrackedSender
 from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume
+from fleet.recording.writing.backfill_plan import QUERY_AFTER_START_S
 from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, MIN_START_BYTES, Reserve, free_bytes, shortage
 from fleet.recording.writing.quota_removal import enforce
 from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
@@ -37,6 +38,8 @@ MAX_BUFFERED_BYTES: Final = 64 * MB
 """Maximum size of the buffer while the disk is full. Further messages are dropped and counted."""
 OVERFLOW_BATCH_BYTES: Final = 100_000
 """Buffered bytes to write and flush before the free space is checked again."""
+NEWCOMER_AFTER_NS: Final = int(QUERY_AFTER_START_S[-1] * 1e9)
+"""The query after the start is for all that is published or heard until then."""
 
 
 class Sync(StrEnum):
@@ -97,9 +100,12 @@ class SessionWriter:
         self.gaps: dict[str, int] = {}
         """Keys with new gaps, each with the time of the sender's last message before the gap (0 if there was none). The
         recorder requests a backfill for them and clears them."""
+        self.newcomers: set[str] = set()
+        """Keys of senders whose first messages were not heard, perhaps because they had no link. The recorder requests
+        a backfill for them and clears them."""
         if after is not None:
             self._trackers = {key: tracker.following() for key, tracker in after._trackers.items()}
-            self.gaps = after.gaps
+            self.gaps, self.newcomers = after.gaps, after.newcomers
         self._drops: dict[str, int] = {}
         """Lost messages by key: those that did not fit on the disk, and those without a number that did not fit into
         the queue."""
@@ -154,8 +160,13 @@ class SessionWriter:
             if known is not None and known.last == sequence - 1:
                 known.last = sequence
             else:
+                # A late message may reach this recorder after the one before it has fetched a copy and was killed.
+                if known is None and self._is_recorded(key, sequence, str(encoding), payload, published_ns):
+                    return
                 if not state.tracker.add_live(sender, sequence, hash(payload)):
                     return
+                if known is None:
+                    self._note_newcomer(key, sequence, received_ns)
                 known = state.tracker.senders[sender]
                 self._clocks.add(key, published_ns, received_ns)
                 self._irregular_keys.add(key)
@@ -187,20 +198,33 @@ class SessionWriter:
         if state is None or state.encoding != sample.encoding:
             state = self._key_state(key, sample.encoding)
         payload = sample.payload.to_bytes()
+        before = state.tracker.senders.get(sender)
+        gaps_before = 0 if before is None else len(before.gaps)
         if not state.tracker.add_backfilled(sender, sequence, hash(payload)):
             return False
-        if self._recorded and self._is_recorded(key, sequence, str(sample.encoding), payload, published_ns):
+        if self._is_recorded(key, sequence, str(sample.encoding), payload, published_ns):
             return False
         self._irregular_keys.add(key)
         known = state.tracker.senders[sender]
         known.heard_ns = known.heard_ns or received_ns
         if was_missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
+        elif len(known.gaps) > gaps_before:  # the answer did not go back far enough
+            self._request(key, known)
+        if before is None:
+            self._note_newcomer(key, sequence, self._clocks.received_ns(key, published_ns))
         self._write((state, received_ns, payload, published_ns, sequence))
         return True
 
+    def _note_newcomer(self, key: str, sequence: int, heard_ns: int) -> None:
+        """Note a new sender, unless all that it has published since the session's begin was or will be asked for."""
+        if sequence > 1 and heard_ns > self.resume_since_ns + NEWCOMER_AFTER_NS:
+            self.newcomers.add(key)
+
     def _is_recorded(self, key: str, sequence: int, encoding: str, payload: bytes, published_ns: int) -> bool:
         """Return True if the interrupted session has this message."""
+        if not self._recorded:
+            return False
         told = identity(messages.name_in(encoding) or "", payload, published_ns)
         return (key, sequence, told) in self._recorded
 

@@ -11,6 +11,7 @@ from fleet.recording.writing.backfill_plan import (
     MAX_ANSWERS_OF_OTHERS,
     MAX_SINGLE_SOURCES,
     QUERY_AFTER_GAP_S,
+    QUERY_AFTER_NEWCOMER_S,
     QUERY_AFTER_RECONNECT_S,
     QUERY_AFTER_START_S,
     QUERY_INTERVAL_S,
@@ -96,6 +97,25 @@ def test_car_that_did_not_answer_is_asked_again_since_its_first_gap(cause: str) 
     (query,) = queries
     assert query.source == (EVERYTHING if cause == "reconnect" else "fleet/blue")
     assert query.since == NOW - 30.0 - GAP_MARGIN_S
+
+
+def test_newcomer_is_asked_for_everything_since_the_begin() -> None:
+    plan = started()
+    plan.add_newcomers([STATE, EVENT], NOW - 10.0, NOW)
+    query = PlannedQuery("fleet/blue", NOW - 10.0 - GAP_MARGIN_S)
+    assert asked_at(plan, NOW + 10.0, STATE, EVENT) == [(after, query) for after in QUERY_AFTER_NEWCOMER_S]
+    assert not plan.last_queries()
+
+
+def test_answer_of_all_for_a_younger_gap_does_not_count() -> None:
+    """A car had not answered for an older gap, and was forgotten because all were asked for the last seconds."""
+    plan = started()
+    plan.add_gaps({STATE: NOW - 30.0}, NOW - 2.0, NOW)
+    plan.due_queries(NOW + 10.0)
+    answer(plan, [PlannedQuery(EVERYTHING, NOW - 5.0)], STATE)
+    assert plan.last_queries() == [PlannedQuery("fleet/blue", NOW - 30.0 - GAP_MARGIN_S)]
+    answer(plan, [PlannedQuery(EVERYTHING, NOW - 40.0)], STATE)
+    assert plan.last_queries() == []
 
 
 def test_many_sources_are_asked_at_once() -> None:

@@ -1,0 +1,42 @@
+"""The search for messages that a recorder loses or writes twice, with 40 recordings. `make soak` plays 10,000."""
+
+from pathlib import Path
+
+import pytest
+
+from fleet.recording.sequence_tracker import SequenceTracker
+from fleet.recording.writing.backfill_plan import BackfillPlan
+from fleet.recording.writing.session_writer import SessionWriter
+from tests.fuzz.recording_search import play
+
+EPISODES = 40
+
+
+def test_40_recordings_lose_nothing_silently_and_have_nothing_twice(tmp_path: Path) -> None:
+    episodes = {seed: play(seed, tmp_path / str(seed)) for seed in range(EPISODES)}
+    assert {seed: episode.violations for seed, episode in episodes.items() if episode.violations} == {}
+    assert sum(episode.kills for episode in episodes.values()) > EPISODES // 2
+    assert sum(len(episode.paths) for episode in episodes.values()) > 3 * EPISODES
+    assert sum(len(episode.published) for episode in episodes.values()) > 400 * EPISODES
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "broken", "seed", "words"),
+    [
+        (BackfillPlan, "add_newcomers", lambda *_: None, 3, "lacks"),
+        (SessionWriter, "_request", lambda *_: None, 9, "lacks"),
+        (SessionWriter, "_is_recorded", lambda *_: False, 13, "twice"),
+        (SequenceTracker, "_skip", lambda *_: None, 9, "says"),
+    ],
+    ids=["newcomers", "gaps", "known", "count"],
+)
+def test_search_finds(
+    place: object, name: str, broken: object, seed: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(place, name, broken)
+    assert any(words in each for each in play(seed, tmp_path).violations)
+
+
+def test_gap_that_an_answer_shows_is_asked_for(tmp_path: Path) -> None:
+    """In this recording, an answer does not go back to the message before it, and the next one follows it."""
+    assert play(693, tmp_path).violations == []
