@@ -119,8 +119,8 @@ _SIDES: Final[Mapping[Motion, tuple[float, float]]] = {
     Motion.SPIN_RIGHT: (1.0, -1.0),
 }
 """Shares of the left and the right wheel."""
-_BOOT: Final = re.compile(rb"rst:0x|boot:0x|entry 0x|\bets [A-Z]")
-"""Text of the ESP32's own boot program."""
+_BOOT: Final = re.compile(rb"rst:0x|boot:0x|entry 0x|\bets [A-Z]|LittleFS|servos status checked|Server Starts")
+"""Texts of the ESP32's own boot program, and of the car's, if the first ones are lost."""
 # The echo of one of our lines, which may come late, or a servo error (1005), which the car prints by itself.
 _OWN: Final = re.compile(rf'\{{"T":({"|".join(map(str, {*ALLOWED, 1005}))})[,}}]'.encode())
 
