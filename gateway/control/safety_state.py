@@ -131,7 +131,7 @@ class Safety(Struct):
         named = list(ended)
         removed = self.end(each for each in named if each in self._estops and self._estops[each].fleet_wide)
         # Also unknown ones, because a third gateway may still report them as in force.
-        _remember(self._ended, (each for each in named if each not in self._estops), MAX_ENDED_ESTOPS)
+        _note_unknown(self._ended, (each for each in named if each not in self._estops), MAX_ENDED_ESTOPS)
         known = {*self._estops, *self._ended}
         shared = [each for each in estops if each.fleet_wide]
         latched = [self.latch(each) for each in shared if each.id not in known]
@@ -161,7 +161,9 @@ class Safety(Struct):
         self, pauses: Iterable[FleetPause], ended: Iterable[str]
     ) -> tuple[list[FleetPause], list[FleetPause]]:
         """Merge the pauses of another gateway. Return (joined, removed). An ended pause stays ended."""
-        removed = self.end_pauses(each for each in ended if each not in self._ended_pauses)
+        named = list(ended)
+        removed = self.end_pauses(each for each in named if each in self._pauses)
+        _note_unknown(self._ended_pauses, named, MAX_ENDED_PAUSES)
         return [pause for pause in pauses if self.pause(pause)], removed
 
     # ------------------------------------------------------------------ loan
@@ -207,6 +209,19 @@ def _remember(ended: dict[str, None], ids: Iterable[str], maximum: int) -> None:
     ended.update(dict.fromkeys(ids))
     while len(ended) > maximum:
         del ended[next(iter(ended))]
+
+
+def _note_unknown(ended: dict[str, None], ids: Iterable[str], maximum: int) -> None:
+    """Add ids of which only another gateway knows that they have ended, as the oldest ones, as far as there is room.
+
+    Added as the newest ones, they would replace what has just ended here. And several gateways that together remember
+    more than the maximum would replace each other's ids for ever, and save their states each time.
+    """
+    unknown = [each for each in dict.fromkeys(ids) if each not in ended]
+    if room := max(maximum - len(ended), 0):
+        known = list(ended)
+        ended.clear()
+        ended.update(dict.fromkeys([*unknown[-room:], *known]))
 
 
 def _strength(pause: FleetPause) -> tuple[int, int, str, str]:

@@ -105,6 +105,27 @@ def test_ended_estop_does_not_come_back_through_a_third_gateway() -> None:
     assert green.estops == ()
 
 
+def test_ended_ids_of_others_replace_none_of_our_own() -> None:
+    """Each gateway remembers as many as it may. Green hangs, and has not heard that the e-stop and the pause ended."""
+    red, blue, green = Safety(), Safety(), Safety()
+    for name, car in {"red": red, "blue": blue, "green": green}.items():
+        for number in range(MAX_ENDED_ESTOPS):
+            car.latch(estop(f"{name} {number}", fleet_wide=False))
+            car.end([f"{name} {number}"])
+            car.end_pauses([f"{name} {number}"])
+        car.latch(estop("fleet"))
+        car.pause(FleetPause("fleet", "eve", "", 7))
+    for car in (red, blue):
+        car.end(["fleet"])
+        car.end_pauses(["fleet"])
+    before = red.persisted
+    for other in (blue, green):
+        assert red.merge(other.estops, other.ended) == ([], [])
+        assert red.merge_pauses(other.pauses, other.ended_pauses) == ([], [])
+    assert red.persisted == before
+    assert [each.id for each in green.merge(red.estops, red.ended)[1]] == ["fleet"]
+
+
 def test_gateway_without_people_learns_rank_of_estop() -> None:
     """The e-stop of a lead reaches each gateway directly. A gateway without people latches it as a person's."""
     own = estop("a")
