@@ -363,7 +363,10 @@ class Controller(Generic[D_co]):
 
     def _unpause(self, pending: Pending, ids: tuple[str, ...], now: float) -> Answer:
         by = pending.command.sender.name
-        if not self.safety.end_pauses(ids or [each.id for each in self.safety.pauses]):
+        # Only those in force: whether the sender may end an unknown one can only be said where it is known. If its end
+        # came earlier than the pause itself, this gateway learns of the end from the others.
+        in_force = [each.id for each in self.safety.pauses]
+        if not self.safety.end_pauses(each for each in in_force if not ids or each in ids):
             return self._done(pending, "was not paused", now)
         self._log.log(Level.INFO, "unpaused", f"the pause of {self.car} was ended by {by}", now)
         return self._done(pending, "the pause has ended", now)

@@ -280,9 +280,21 @@ def test_unpause_with_ids_ends_only_those(desk: Workbench) -> None:
     first, second = desk.control.safety.pauses
     assert desk.ask(Unpause((first.id, "unknown")), TEACHER).status is Phase.SENT
     assert desk.control.safety.pauses == (second,)
-    assert {*desk.control.safety.ended_pauses} == {first.id, "unknown"}
+    assert desk.control.safety.ended_pauses == (first.id,)
     assert desk.ask(Unpause(), TEACHER).status is Phase.SENT
     assert desk.control.safety.pauses == ()
+
+
+def test_pause_that_a_gateway_does_not_know_is_not_ended_by_its_id(desk: Workbench) -> None:
+    """A gateway that has just started knows no pause. Asked to end that of a lead, it told all others that it ended."""
+    pause = FleetPause("p1", "teacher@lab", "listen", 7, LEAD)
+    started = Workbench().ready()
+    desk.control.merge_pauses([pause], [], "blue", desk.now)
+    assert started.ask(Unpause(("p1",)), ANN).words == "was not paused"
+    desk.control.merge_pauses(started.control.safety.pauses, started.control.safety.ended_pauses, "new", desk.now)
+    assert desk.control.safety.pauses == (pause,)
+    started.control.merge_pauses(desk.control.safety.pauses, (), "red", started.now)
+    assert started.control.safety.pauses == (pause,)
 
 
 def test_refused_pause_stops_nothing(desk: Workbench) -> None:
