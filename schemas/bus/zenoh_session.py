@@ -476,7 +476,9 @@ class Bus:
 
         self._start_to_report_tokens()
         self._declare(declare)
-        if awaited and not complete.wait(_TOKEN_HISTORY_TIMEOUT_S):
+        # The thread that calls back cannot wait for itself: a callback that declares a watch gets its calls afterwards.
+        is_callback = threading.current_thread() is self._token_reporter
+        if awaited and (is_callback or not complete.wait(_TOKEN_HISTORY_TIMEOUT_S)):
             self._answered_over = ""
         with self._lock:
             self._alive[expression] = alive

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from schemas import bus, messages, topics
+from schemas.bus import zenoh_session
 from schemas.bus.zenoh_session import LINK_TIMEOUT_S
 from schemas.gen import fleet_v1_pb2 as pb
 from tests.support import processes
@@ -186,6 +187,21 @@ def test_error_of_a_callback_ends_no_other_watch(endpoint: str) -> None:
             wait_for(lambda: errors == [ZeroDivisionError])
     finally:
         threading.excepthook = hook
+
+
+def test_callback_may_declare_a_watch(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waited for its own thread to report the tokens of that watch, and no other callback ran meanwhile."""
+    monkeypatch.setattr(zenoh_session, "_TOKEN_HISTORY_TIMEOUT_S", 2 * processes.PATIENCE_S)
+    with bus.Bus.open(endpoint) as cars, bus.Bus.open(endpoint) as watcher:
+        seen: list[str] = []
+        for token in THERE:
+            cars.token(token)
+        wait_for(lambda: watcher.tokens("*/*") == THERE)
+        began = time.monotonic()
+        watcher.watch_tokens("fleet/*", lambda *_: watcher.watch_tokens("two/*", lambda key, alive: seen.append(key)))
+        wait_for(lambda: seen == ["two/red"])
+        assert time.monotonic() < began + processes.PATIENCE_S
+        assert watcher.tokens("two/*") == ["two/red"]
 
 
 def listed_link(opened: bus.Bus) -> str:
