@@ -185,7 +185,7 @@ class RecordingEpisode:
         self.next_poll = self.now
         self.next_tick = self.now + 1.0
         self.gaps: dict[str, float] = {}
-        self.newcomers: set[str] = set()
+        self.newcomers: dict[str, str] = {}
         self.since = self.now - age_s
         self.queue.clear()
         self.answers.clear()
@@ -258,7 +258,7 @@ class RecordingEpisode:
     def plan_missing(self) -> None:
         """Plan queries for gaps and newcomers."""
         gaps, self.gaps = self.gaps, {}
-        newcomers, self.newcomers = self.newcomers, set()
+        newcomers, self.newcomers = self.newcomers, {}
         self.plan.add_gaps(gaps, self.polls[0], self.now)
         self.plan.add_newcomers(newcomers, self.since, self.now)
 
@@ -269,9 +269,11 @@ class RecordingEpisode:
         delay_s = self.moments.choice([0.01, 0.3, 1.0]) * self.moments.random() if delay_s is None else delay_s
         whole = self.moments.random() > self.loss
         for car in self.cars:
-            if query.source not in (EVERYTHING, f"fleet/{car.name}") or not car.linked or self.now < car.back_at + 0.2:
+            if not car.linked or self.now < car.back_at + 0.2:
                 continue
             for publisher in car.publishers:
+                if query.source not in (EVERYTHING, f"fleet/{car.name}", publisher.key):
+                    continue
                 own_now_ns = self.now_ns + int((car.offset_s + delay_s / 2) * 1e9)
                 part = [each for each in publisher.cache if each.timestamp.ns >= own_now_ns - length_s * 1e9]
                 found += part if whole else part[: len(part) // 2]

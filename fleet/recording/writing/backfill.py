@@ -49,7 +49,8 @@ class Backfill:
         self._lock = threading.Lock()
         self._gaps: dict[str, float] = {}
         """Keys with the time from which messages are missing, s, monotonic."""
-        self._newcomers: set[str] = set()
+        self._newcomers: dict[str, str] = {}
+        """Keys with the source to ask."""
         self._answers: list[zenoh.Sample] = []
         self._closing = threading.Event()
         self._until = inf
@@ -89,10 +90,13 @@ class Backfill:
                 if _has_cache(key):
                     self._gaps[key] = min(now - age_s, self._gaps.get(key, now))
 
-    def request_newcomers(self, keys: Iterable[str]) -> None:
-        """Request all that the senders of these keys have published during the recording, before they were heard."""
+    def request_newcomers(self, sources: Mapping[str, str]) -> None:
+        """Request all that the senders of these keys have published during the recording, before they were heard.
+
+        Each value is the source to ask: a car, or only the key.
+        """
         with self._lock:
-            self._newcomers.update(filter(_has_cache, keys))
+            self._newcomers.update((key, source) for key, source in sources.items() if _has_cache(key))
 
     def take_answers(self) -> list[zenoh.Sample]:
         """Return the answers since the last call. Some may be recorded already."""
@@ -126,7 +130,7 @@ class Backfill:
     def _plan_missing(self, silent_since: float, now: float) -> None:
         with self._lock:
             gaps, self._gaps = self._gaps, {}
-            newcomers, self._newcomers = self._newcomers, set()
+            newcomers, self._newcomers = self._newcomers, {}
         self._plan.add_gaps(gaps, silent_since, now)
         self._plan.add_newcomers(newcomers, self._begin, now)
 

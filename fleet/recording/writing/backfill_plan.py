@@ -4,8 +4,10 @@ When should the recorder ask? After its own link to the hub is back: it asks all
 publisher, which shows that the *car* was cut off: it asks all publishers of this car, because some of them are silent
 for minutes. The command events of this car may have a gap, too. Only the next event would show it, and after the last
 command there is no next event. When a sender is heard for the first time, but not from its first message on, it may
-have published without a link: the recorder asks this car, too, since the begin of the recording. And the recorder asks
-shortly after its start. If it continues an interrupted session, it asks at once, too, and further back.
+have published without a link: the recorder asks this car, too, since the begin of the recording. But most cars are
+heard at once, and their command events only at the first command. Then it asks for the key alone: otherwise, the first
+stop of the whole fleet would call up all that all cars have cached. And the recorder asks shortly after its start. If
+it continues an interrupted session, it asks at once, too, and further back.
 
 One query is not enough, because others may reconnect half a second later than we do, and on a loaded machine even
 later. So a reconnect and a gap plan several queries each (`QUERY_AFTER_...`). Their answers overlap, but that does no
@@ -50,7 +52,7 @@ EVERYTHING: Final = ""
 
 
 class PlannedQuery(Struct, frozen=True):
-    """Ask this source, or EVERYTHING, for what it has published since this time."""
+    """Ask this source, which may also be a key, or EVERYTHING, for what it has published since this time."""
 
     source: str
     since: float
@@ -70,7 +72,7 @@ class _Asked(Struct):
 
 
 class BackfillPlan:
-    """The queries of one recorder. A source is a car or a service: the first two chunks of its keys."""
+    """The queries of one recorder. A source is a car or a service, the first two chunks of its keys, or one key."""
 
     def __init__(self, now: float, *, resume_since: float | None = None) -> None:
         """Begin. `resume_since`: the time from which to ask if this recording continues an interrupted session."""
@@ -94,15 +96,15 @@ class BackfillPlan:
         for key in gaps:
             self._asked[source_of(key)].keys.setdefault(key, 0)
 
-    def add_newcomers(self, keys: Collection[str], since: float, now: float) -> None:
-        """Plan queries for keys whose senders have published before they were heard.
+    def add_newcomers(self, sources: Mapping[str, str], since: float, now: float) -> None:
+        """Plan queries for keys whose senders have published before they were heard, each with the source to ask.
 
         `since`: the begin of the recording.
         """
-        for source in {source_of(key) for key in keys}:
+        for source in set(sources.values()):
             self._plan(source, since - GAP_MARGIN_S, QUERY_AFTER_NEWCOMER_S, now)
-        for key in keys:
-            self._asked[source_of(key)].keys.setdefault(key, 0)
+        for key, source in sources.items():
+            self._asked[source].keys.setdefault(key, 0)
 
     def add_reconnect(self, since: float, now: float) -> None:
         """Plan queries after our own link was lost, which was whole until `since`."""
@@ -158,11 +160,10 @@ class BackfillPlan:
             asked.due = [each for each in asked.due if each[0] > now]
             asked.asked_at = now
             since[source] = asked.unanswered_since = min([asked.unanswered_since, *served])
-        if not since:
-            return []
+        keys = [PlannedQuery(each, since.pop(each)) for each in sorted(since) if source_of(each) != each]
         if EVERYTHING in since or len(since) > MAX_SINGLE_SOURCES:
-            return [PlannedQuery(EVERYTHING, min(since.values()))]
-        return [PlannedQuery(each, since[each]) for each in sorted(since)]
+            return [PlannedQuery(EVERYTHING, min(since.values())), *keys]
+        return [*(PlannedQuery(each, since[each]) for each in sorted(since)), *keys]
 
 
 def source_of(key: str) -> str:

@@ -25,7 +25,7 @@ from fleet.recording.sequence_tracker import SequenceTracker, TrackedSender
 from fleet.recording.stop_count import StopCount
 from fleet.recording.time_spec import format_utc
 from fleet.recording.writing import resume
-from fleet.recording.writing.backfill_plan import QUERY_AFTER_START_S
+from fleet.recording.writing.backfill_plan import QUERY_AFTER_START_S, source_of
 from fleet.recording.writing.disk_space import MB, MIN_CLOSE_BYTES, MIN_START_BYTES, Reserve, free_bytes, shortage
 from fleet.recording.writing.quota_removal import enforce
 from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
@@ -39,7 +39,7 @@ MAX_BUFFERED_BYTES: Final = 64 * MB
 OVERFLOW_BATCH_BYTES: Final = 100_000
 """Buffered bytes to write and flush before the free space is checked again."""
 NEWCOMER_AFTER_NS: Final = int(QUERY_AFTER_START_S[-1] * 1e9)
-"""The query after the start is for all that is published or heard until then."""
+"""The query after the start is for all that is published until then, and asks all who are heard until then."""
 
 
 class Sync(StrEnum):
@@ -100,12 +100,14 @@ class SessionWriter:
         self.gaps: dict[str, int] = {}
         """Keys with new gaps, each with the time of the sender's last message before the gap (0 if there was none). The
         recorder requests a backfill for them and clears them."""
-        self.newcomers: set[str] = set()
-        """Keys of senders whose first messages were not heard, perhaps because they had no link. The recorder requests
-        a backfill for them and clears them."""
+        self.newcomers: dict[str, str] = {}
+        """Keys of senders whose first messages were not heard, perhaps because they had no link, each with the source
+        to ask. The recorder requests a backfill for them and clears them."""
+        self._asked: set[Hashable] = set()
+        """Zenoh sessions that were heard early enough that the query after the start has asked all their senders."""
         if after is not None:
             self._trackers = {key: tracker.following() for key, tracker in after._trackers.items()}
-            self.gaps, self.newcomers = after.gaps, after.newcomers
+            self.gaps, self.newcomers, self._asked = after.gaps, after.newcomers, after._asked
         self._drops: dict[str, int] = {}
         """Lost messages by key: those that did not fit on the disk, and those without a number that did not fit into
         the queue."""
@@ -166,7 +168,9 @@ class SessionWriter:
                 if not state.tracker.add_live(sender, sequence, hash(payload)):
                     return
                 if known is None:
-                    self._note_newcomer(key, sequence, received_ns)
+                    if received_ns <= self.resume_since_ns + NEWCOMER_AFTER_NS:
+                        self._asked.add(entity.zid)
+                    self._note_newcomer(key, sender, sequence, received_ns)
                 known = state.tracker.senders[sender]
                 self._clocks.add(key, published_ns, received_ns)
                 self._irregular_keys.add(key)
@@ -212,14 +216,14 @@ class SessionWriter:
         elif len(known.gaps) > gaps_before:  # the answer did not go back far enough
             self._request(key, known)
         if before is None:
-            self._note_newcomer(key, sequence, self._clocks.received_ns(key, published_ns))
+            self._note_newcomer(key, sender, sequence, self._clocks.received_ns(key, published_ns))
         self._write((state, received_ns, payload, published_ns, sequence))
         return True
 
-    def _note_newcomer(self, key: str, sequence: int, heard_ns: int) -> None:
+    def _note_newcomer(self, key: str, sender: tuple[Hashable, int], sequence: int, heard_ns: int) -> None:
         """Note a new sender, unless all that it has published since the session's begin was or will be asked for."""
         if sequence > 1 and heard_ns > self.resume_since_ns + NEWCOMER_AFTER_NS:
-            self.newcomers.add(key)
+            self.newcomers[key] = key if sender[0] in self._asked else source_of(key)
 
     def _is_recorded(self, key: str, sequence: int, encoding: str, payload: bytes, published_ns: int) -> bool:
         """Return True if the interrupted session has this message."""

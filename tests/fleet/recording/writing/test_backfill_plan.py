@@ -101,10 +101,24 @@ def test_car_that_did_not_answer_is_asked_again_since_its_first_gap(cause: str) 
 
 def test_newcomer_is_asked_for_everything_since_the_begin() -> None:
     plan = started()
-    plan.add_newcomers([STATE, EVENT], NOW - 10.0, NOW)
+    plan.add_newcomers({STATE: "fleet/blue", EVENT: "fleet/blue"}, NOW - 10.0, NOW)
     query = PlannedQuery("fleet/blue", NOW - 10.0 - GAP_MARGIN_S)
     assert asked_at(plan, NOW + 10.0, STATE, EVENT) == [(after, query) for after in QUERY_AFTER_NEWCOMER_S]
     assert not plan.last_queries()
+
+
+def test_first_stop_of_a_fleet_asks_for_the_events_alone() -> None:
+    """The window since the begin is for these keys, also if all cars are asked for the last seconds at that time."""
+    plan = started()
+    events = [f"fleet/car{number}/event/command" for number in range(2 * MAX_SINGLE_SOURCES)]
+    plan.add_newcomers({each: each for each in events}, NOW - 1000.0, NOW)
+    plan.add_reconnect(NOW - 1.0, NOW - QUERY_AFTER_RECONNECT_S[0])
+    asked = plan.due_queries(NOW)
+    assert asked[0] == PlannedQuery(EVERYTHING, NOW - 1.0)
+    assert {each.source: each.since for each in asked[1:]} == dict.fromkeys(events, NOW - 1000.0 - GAP_MARGIN_S)
+    for query in [*asked, *plan.due_queries(NOW + QUERY_AFTER_NEWCOMER_S[-1])]:
+        plan.add_answers(query, [query.source] if query.source else events)
+    assert {each.source for each in plan.last_queries()} == {EVERYTHING}
 
 
 def test_answer_of_all_for_a_younger_gap_does_not_count() -> None:

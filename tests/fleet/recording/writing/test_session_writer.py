@@ -222,6 +222,22 @@ def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
     tape.close(BEGUN_NS + 9 * SECOND_NS)
 
 
+def test_first_event_of_a_car_that_was_heard_at_once_asks_for_its_key_alone(tmp_path: Path) -> None:
+    """The first stop of all cars, half an hour later, called up all that all cars had cached, twice."""
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    with zenoh.open(alone()) as red, zenoh.open(alone()) as blue:
+        state, *events = (each.declare_publisher("fleet/note").id for each in (red, red, blue))
+    tape.add("fleet/red/state/link", b"{}", JSON, None, zenoh.SourceInfo(state, 7), BEGUN_NS + SECOND_NS // 2)
+    after = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS + SECOND_NS, after=tape)
+    tape.close(BEGUN_NS + SECOND_NS)
+    for car, sender in zip(("red", "blue"), events, strict=True):
+        source = zenoh.SourceInfo(sender, 4)
+        after.add(f"fleet/{car}/event/command", b"{}", JSON, None, source, BEGUN_NS + 1800 * SECOND_NS)
+    asked = {"fleet/red/event/command": "fleet/red/event/command", "fleet/blue/event/command": "fleet/blue"}
+    assert after.newcomers == asked
+    after.close(BEGUN_NS + 1801 * SECOND_NS)
+
+
 def published(count: int) -> list[zenoh.Sample]:
     """Return samples of one publisher, numbered from 1."""
     samples: list[zenoh.Sample] = []
