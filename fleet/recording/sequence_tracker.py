@@ -10,6 +10,8 @@ from msgspec import Struct, field
 
 MAX_TRACKED_SOURCES: Final = 16
 """Maximum number of senders to remember per key. Each `fleet drive` is a new sender."""
+MAX_FORGOTTEN_SOURCES: Final = 256
+"""Maximum number of further senders of which only the name is remembered, so that they are not taken for new ones."""
 MAX_OPEN_GAPS: Final = 256
 """Maximum number of gaps of one sender that a backfill may close. Older gaps are only counted."""
 MAX_LISTED_GAPS: Final = 1000
@@ -77,11 +79,12 @@ class SequenceTracker:
     `last` itself. The caller also sets `heard_ns`.
     """
 
-    __slots__ = ("_early", "_lost", "senders")
+    __slots__ = ("_early", "_forgotten", "_lost", "senders")
 
     def __init__(self) -> None:
         self.senders: dict[Hashable, TrackedSender] = {}
         self._early: dict[tuple[Hashable, int], int] = {}
+        self._forgotten: dict[Hashable, None] = {}
         self._lost = 0
 
     def following(self) -> "SequenceTracker":
@@ -91,7 +94,7 @@ class SequenceTracker:
         missing only here, but if their messages come, the next session takes them.
         """
         tracker = SequenceTracker()
-        tracker._early = self._early
+        tracker._early, tracker._forgotten = self._early, self._forgotten
         for name, sender in self.senders.items():
             earlier = [*sender.earlier_gaps, *sender.gaps][-MAX_OPEN_GAPS:]
             tracker.senders[name] = TrackedSender(sender.last, sender.first, sender.heard_ns, earlier_gaps=earlier)
@@ -101,6 +104,10 @@ class SequenceTracker:
     def missing(self) -> int:
         """Return the number of missing messages."""
         return self._lost + sum(gap.count for sender in self.senders.values() for gap in sender.gaps)
+
+    def has_forgotten(self, sender: Hashable) -> bool:
+        """Return True if this sender was heard before, although its numbers had to be forgotten at some time."""
+        return sender in self._forgotten
 
     def add_live(self, sender: Hashable, number: int, content: int) -> bool:
         """Add a message that is not consecutive. Return False if it was backfilled before.
@@ -173,6 +180,9 @@ class SequenceTracker:
         if len(self.senders) >= MAX_TRACKED_SOURCES:
             oldest = min(self.senders, key=lambda each: self.senders[each].heard_ns)  # silent for the longest time
             self._lost += sum(gap.count for gap in self.senders.pop(oldest).gaps)
+            self._forgotten[oldest] = None
+            if len(self._forgotten) > MAX_FORGOTTEN_SOURCES:
+                del self._forgotten[next(iter(self._forgotten))]
         self.senders[sender] = known = TrackedSender(number, number)
         return known
 

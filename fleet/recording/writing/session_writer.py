@@ -222,6 +222,9 @@ class SessionWriter:
 
     def _note_newcomer(self, key: str, sender: tuple[Hashable, int], sequence: int, heard_ns: int) -> None:
         """Note a new sender, unless all that it has published since the session's begin was or will be asked for."""
+        # If more senders publish on one key than are remembered, each of them seems to be new again and again.
+        if self._trackers[key].has_forgotten(sender):
+            return
         if sequence > 1 and heard_ns > self.resume_since_ns + NEWCOMER_AFTER_NS:
             self.newcomers[key] = key if sender[0] in self._asked else source_of(key)
 

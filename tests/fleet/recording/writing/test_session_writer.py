@@ -15,6 +15,7 @@ from fleet.quota import Quota
 from fleet.recording import session_dir
 from fleet.recording.reading.session import Session
 from fleet.recording.selection import EVERYTHING
+from fleet.recording.sequence_tracker import MAX_TRACKED_SOURCES
 from fleet.recording.session_dir import SessionInfo
 from fleet.recording.time_spec import format_utc
 from fleet.recording.tools.merge_cut_recover import cut
@@ -236,6 +237,20 @@ def test_first_event_of_a_car_that_was_heard_at_once_asks_for_its_key_alone(tmp_
     asked = {"fleet/red/event/command": "fleet/red/event/command", "fleet/blue/event/command": "fleet/blue"}
     assert after.newcomers == asked
     after.close(BEGUN_NS + 1801 * SECOND_NS)
+
+
+def test_senders_that_share_a_key_are_new_only_once(tmp_path: Path) -> None:
+    """With more senders than are remembered, the recorder asked again and again, and wrote each answer again."""
+    tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    with zenoh.open(alone()) as one:
+        senders = [one.declare_publisher("fleet/note").id for _ in range(MAX_TRACKED_SOURCES + 2)]
+    for turn in (1, 2, 3):
+        for sender in senders:
+            source = zenoh.SourceInfo(sender, turn)
+            tape.add("fleet/note", b"{}", JSON, None, source, BEGUN_NS + 10 * SECOND_NS)
+        assert bool(tape.newcomers) is (turn == 1)
+        tape.newcomers.clear()
+    tape.close(BEGUN_NS + 11 * SECOND_NS)
 
 
 def published(count: int) -> list[zenoh.Sample]:
