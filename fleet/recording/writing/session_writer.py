@@ -103,11 +103,13 @@ class SessionWriter:
         self.newcomers: dict[str, str] = {}
         """Keys of senders whose first messages were not heard, perhaps because they had no link, each with the source
         to ask. The recorder requests a backfill for them and clears them."""
+        self._asked_until_ns = now_ns + NEWCOMER_AFTER_NS
         self._asked: set[Hashable] = set()
-        """Zenoh sessions that were heard early enough that the query after the start has asked all their senders."""
+        """Zenoh sessions that were heard until then, so that all their senders were asked, soon after the start."""
         if after is not None:
             self._trackers = {key: tracker.following() for key, tracker in after._trackers.items()}
-            self.gaps, self.newcomers, self._asked = after.gaps, after.newcomers, after._asked
+            self.gaps, self.newcomers = after.gaps, after.newcomers
+            self._asked_until_ns, self._asked = after._asked_until_ns, after._asked
         self._drops: dict[str, int] = {}
         """Lost messages by key: those that did not fit on the disk, and those without a number that did not fit into
         the queue."""
@@ -168,7 +170,7 @@ class SessionWriter:
                 if not state.tracker.add_live(sender, sequence, hash(payload)):
                     return
                 if known is None:
-                    if received_ns <= self.resume_since_ns + NEWCOMER_AFTER_NS:
+                    if received_ns <= self._asked_until_ns:
                         self._asked.add(entity.zid)
                     self._note_newcomer(key, sender, sequence, received_ns)
                 known = state.tracker.senders[sender]
@@ -226,7 +228,8 @@ class SessionWriter:
         if self._trackers[key].has_forgotten(sender):
             return
         if sequence > 1 and heard_ns > self.resume_since_ns + NEWCOMER_AFTER_NS:
-            self.newcomers[key] = key if sender[0] in self._asked else source_of(key)
+            was_asked = heard_ns > self._asked_until_ns and sender[0] in self._asked
+            self.newcomers[key] = key if was_asked else source_of(key)
 
     def _is_recorded(self, key: str, sequence: int, encoding: str, payload: bytes, published_ns: int) -> bool:
         """Return True if the interrupted session has this message."""

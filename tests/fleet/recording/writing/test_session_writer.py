@@ -223,12 +223,21 @@ def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
     tape.close(BEGUN_NS + 9 * SECOND_NS)
 
 
-def test_first_event_of_a_car_that_was_heard_at_once_asks_for_its_key_alone(tmp_path: Path) -> None:
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_first_event_of_a_car_that_was_heard_at_once_asks_for_its_key_alone(interrupted: bool, tmp_path: Path) -> None:
     """The first stop of all cars, half an hour later, called up all that all cars had cached, twice."""
+    if interrupted:
+        killed = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS - 5 * SECOND_NS)
+        assert killed._segment is not None
+        killed._segment.cut()
+        os.utime(session_dir.segment(killed.path, 1), ns=(BEGUN_NS, BEGUN_NS))
     tape = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS)
+    assert bool(tape.description.continues) is interrupted
     with zenoh.open(alone()) as red, zenoh.open(alone()) as blue:
         state, *events = (each.declare_publisher("fleet/note").id for each in (red, red, blue))
     tape.add("fleet/red/state/link", b"{}", JSON, None, zenoh.SourceInfo(state, 7), BEGUN_NS + SECOND_NS // 2)
+    assert tape.newcomers == ({"fleet/red/state/link": "fleet/red"} if interrupted else {})
+    tape.newcomers.clear()
     after = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS + SECOND_NS, after=tape)
     tape.close(BEGUN_NS + SECOND_NS)
     for car, sender in zip(("red", "blue"), events, strict=True):
