@@ -61,7 +61,8 @@ class TrackedSender(Struct):
     """The newest number."""
     first: int
     heard_ns: int = 0
-    """When the newest message was received, ns. If only answers came, when the first of them did. 0 if none did."""
+    """When the newest message was received, ns. If only answers came, about when the first would have been live.
+    0 if none did."""
     gaps: list[Gap] = field(default_factory=list)
     """Gaps that a backfill may still close."""
     earlier_gaps: list[Gap] = field(default_factory=list)

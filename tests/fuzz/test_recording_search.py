@@ -37,6 +37,11 @@ def test_search_finds(
     assert any(words in each for each in play(seed, tmp_path).violations)
 
 
+def test_gap_behind_an_answer_that_broke_off_is_asked_for(tmp_path: Path) -> None:
+    """In this recording, the rest of an answer was asked for only from the time of this answer on."""
+    assert play(50788, tmp_path).violations == []
+
+
 def test_gap_that_an_answer_shows_is_asked_for(tmp_path: Path) -> None:
     """In this recording, an answer does not go back to the message before it, and the next one follows it."""
     assert play(693, tmp_path).violations == []

@@ -212,7 +212,9 @@ class SessionWriter:
             return False
         self._irregular_keys.add(key)
         known = state.tracker.senders[sender]
-        known.heard_ns = known.heard_ns or received_ns
+        # A gap behind an answer that broke off begins at its last message, not when it was received. The clock of the
+        # publisher may be ahead.
+        known.heard_ns = known.heard_ns or min(self._clocks.received_ns(key, published_ns), received_ns)
         if was_missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
         elif len(known.gaps) > gaps_before:  # the answer did not go back far enough
