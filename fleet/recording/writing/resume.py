@@ -17,6 +17,7 @@ from fleet.recording.reading.session import NoSession, Recorded, Session
 from fleet.recording.session_dir import SessionInfo
 from fleet.recording.session_lookup import newest_first
 from fleet.recording.time_spec import iso_ns
+from fleet.recording.writing.backfill_plan import GAP_MARGIN_S
 from fleet.recording.writing.publisher_clocks import PublisherClocks
 from schemas.topics import CACHE_S
 
@@ -47,10 +48,12 @@ def find_interrupted(root: Path, fleet: str, now_ns: int) -> ResumePoint:
     if path is None:
         return ResumePoint("", now_ns)
     start_ns = now_ns - int(RESUME_WINDOW_S * 1e9)
+    # Some queries ask a little further back. Of a publisher whose clock is ahead, the answers look young enough.
+    known_from_ns = start_ns - int(2 * GAP_MARGIN_S * 1e9)
     # If the recorder was killed twice, the first gap may not be backfilled yet. So read the sessions before it, too.
-    chain = _chain(path, start_ns)
+    chain = _chain(path, known_from_ns)
     since_ns, known, clocks = max(start_ns, _started_ns(chain[-1])), set[tuple[str, int, int]](), PublisherClocks()
-    for row in _recorded_since(chain, start_ns):
+    for row in _recorded_since(chain, known_from_ns):
         known.add((row.key, row.sequence, identity(row.message, row.payload, row.published_ns)))
         clocks.add(row.key, row.published_ns, row.recorded_ns)
     return ResumePoint(path.name, since_ns, frozenset(known), clocks)

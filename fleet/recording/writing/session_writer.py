@@ -32,6 +32,7 @@ from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
 from schemas import messages
 from schemas.bus import sequence_of
+from schemas.bus.zenoh_session import RECALL_TIMEOUT_S
 
 MAX_BUFFERED_MESSAGES: Final = 100_000
 MAX_BUFFERED_BYTES: Final = 64 * MB
@@ -39,7 +40,7 @@ MAX_BUFFERED_BYTES: Final = 64 * MB
 OVERFLOW_BATCH_BYTES: Final = 100_000
 """Buffered bytes to write and flush before the free space is checked again."""
 NEWCOMER_AFTER_NS: Final = int(QUERY_AFTER_START_S[-1] * 1e9)
-"""The query after the start is for all that is published until then, and asks all who are heard until then."""
+"""The query after the start is for all that is published until then."""
 
 
 class Sync(StrEnum):
@@ -103,9 +104,9 @@ class SessionWriter:
         self.newcomers: dict[str, str] = {}
         """Keys of senders whose first messages were not heard, perhaps because they had no link, each with the source
         to ask. The recorder requests a backfill for them and clears them."""
-        self._asked_until_ns = now_ns + NEWCOMER_AFTER_NS
+        self._asked_until_ns = now_ns + NEWCOMER_AFTER_NS + int(RECALL_TIMEOUT_S * 1e9)
         self._asked: set[Hashable] = set()
-        """Zenoh sessions that were heard until then, so that all their senders were asked, soon after the start."""
+        """Zenoh sessions that have answered until then: at the start, they were asked for all since the begin."""
         if after is not None:
             self._trackers = {key: tracker.following() for key, tracker in after._trackers.items()}
             self.gaps, self.newcomers = after.gaps, after.newcomers
@@ -170,8 +171,6 @@ class SessionWriter:
                 if not state.tracker.add_live(sender, sequence, hash(payload)):
                     return
                 if known is None:
-                    if received_ns <= self._asked_until_ns:
-                        self._asked.add(entity.zid)
                     self._note_newcomer(key, sender, sequence, received_ns)
                 known = state.tracker.senders[sender]
                 self._clocks.add(key, published_ns, received_ns)
@@ -199,7 +198,9 @@ class SessionWriter:
         was_missing = tracker is not None and tracker.is_missing(sender, sequence)
         # A message in a gap belongs to this session, whatever the clocks say.
         if self._clocks.received_ns(key, published_ns) < self.resume_since_ns and not was_missing:
-            return False
+            return False  # or its clock is slow, and nothing has shown that yet
+        if received_ns <= self._asked_until_ns:
+            self._asked.add(sender[0])
         state = self._states.get(key)
         if state is None or state.encoding != sample.encoding:
             state = self._key_state(key, sample.encoding)
@@ -230,8 +231,7 @@ class SessionWriter:
         if self._trackers[key].has_forgotten(sender):
             return
         if sequence > 1 and heard_ns > self.resume_since_ns + NEWCOMER_AFTER_NS:
-            was_asked = heard_ns > self._asked_until_ns and sender[0] in self._asked
-            self.newcomers[key] = key if was_asked else source_of(key)
+            self.newcomers[key] = key if sender[0] in self._asked else source_of(key)
 
     def _is_recorded(self, key: str, sequence: int, encoding: str, payload: bytes, published_ns: int) -> bool:
         """Return True if the interrupted session has this message."""

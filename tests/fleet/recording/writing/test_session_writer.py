@@ -6,6 +6,8 @@ import time
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import zenoh
@@ -224,7 +226,7 @@ def test_gap_of_a_sender_begins_at_its_own_last_message(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("interrupted", [False, True])
-def test_first_event_of_a_car_that_was_heard_at_once_asks_for_its_key_alone(interrupted: bool, tmp_path: Path) -> None:
+def test_first_event_of_a_car_that_answered_at_once_asks_for_its_key_alone(interrupted: bool, tmp_path: Path) -> None:
     """The first stop of all cars, half an hour later, called up all that all cars had cached, twice."""
     if interrupted:
         killed = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS - 5 * SECOND_NS)
@@ -235,9 +237,15 @@ def test_first_event_of_a_car_that_was_heard_at_once_asks_for_its_key_alone(inte
     assert bool(tape.description.continues) is interrupted
     with zenoh.open(alone()) as red, zenoh.open(alone()) as blue:
         state, *events = (each.declare_publisher("fleet/note").id for each in (red, red, blue))
-    tape.add("fleet/red/state/link", b"{}", JSON, None, zenoh.SourceInfo(state, 7), BEGUN_NS + SECOND_NS // 2)
+        stamp = red.new_timestamp()
+    source = zenoh.SourceInfo(state, 7)
+    tape.add("fleet/red/state/link", b"{}", JSON, None, source, BEGUN_NS + SECOND_NS // 2)
     assert tape.newcomers == ({"fleet/red/state/link": "fleet/red"} if interrupted else {})
     tape.newcomers.clear()
+    answer: Any = SimpleNamespace(
+        key_expr="fleet/red/state/link", payload=zenoh.ZBytes(b"{}"), encoding=JSON, timestamp=stamp, source_info=source
+    )
+    assert not tape.add_backfilled(answer, BEGUN_NS + SECOND_NS)
     after = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS + SECOND_NS, after=tape)
     tape.close(BEGUN_NS + SECOND_NS)
     for car, sender in zip(("red", "blue"), events, strict=True):
