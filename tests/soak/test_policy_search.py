@@ -1,13 +1,11 @@
 """The search for needless and missing decisions of a plan, over 10,000 fleets. `POLICY_SEARCH=FROM:TO` plays others."""
 
-import os
-from concurrent.futures import ProcessPoolExecutor
-
 import pytest
 
 from tests.fuzz.policy_search import play
+from tests.support.soaks import play_all, seeds_from
 
-FIRST, BEHIND = (int(seed) for seed in os.environ.get("POLICY_SEARCH", "1000:11000").split(":"))
+SEEDS = seeds_from("POLICY_SEARCH", "1000:11000")
 
 
 def faults(seed: int) -> tuple[int, list[str]]:
@@ -18,6 +16,4 @@ def faults(seed: int) -> tuple[int, list[str]]:
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 def test_ten_thousand_fleets() -> None:
-    with ProcessPoolExecutor(2) as pool:
-        found = {seed: words for seed, words in pool.map(faults, range(FIRST, BEHIND), chunksize=50) if words}
-    assert found == {}
+    assert {seed: words for seed, words in play_all(faults, SEEDS) if words} == {}

@@ -3,16 +3,15 @@
 `RECORDING_SEARCH=FROM:TO` plays other ones.
 """
 
-import os
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests.fuzz.recording_search import play
+from tests.support.soaks import play_all, seeds_from
 
-FIRST, BEHIND = (int(seed) for seed in os.environ.get("RECORDING_SEARCH", "1000:11000").split(":"))
+SEEDS = seeds_from("RECORDING_SEARCH", "1000:11000")
 
 
 def faults(seed: int) -> tuple[int, list[str], int]:
@@ -26,10 +25,9 @@ def faults(seed: int) -> tuple[int, list[str], int]:
 @pytest.mark.timeout(3600)
 def test_ten_thousand_recordings_lose_nothing_silently() -> None:
     published, found = 0, {}
-    with ProcessPoolExecutor(2) as pool:
-        for seed, violations, count in pool.map(faults, range(FIRST, BEHIND), chunksize=50):
-            published += count
-            if violations:
-                found[seed] = violations
-    print(f"\n{published} messages, seeds {FIRST} to {BEHIND - 1}")
+    for seed, violations, count in play_all(faults, SEEDS):
+        published += count
+        if violations:
+            found[seed] = violations
+    print(f"{published} messages")
     assert found == {}

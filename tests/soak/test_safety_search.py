@@ -3,15 +3,14 @@
 `SAFETY_SEARCH=FROM:TO` plays other ones.
 """
 
-import os
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
 from tests.fuzz.safety_search import play
+from tests.support.soaks import play_all, seeds_from
 
-FIRST, BEHIND = (int(seed) for seed in os.environ.get("SAFETY_SEARCH", "1000:21000").split(":"))
+SEEDS = seeds_from("SAFETY_SEARCH", "1000:21000")
 
 
 def faults(seed: int) -> tuple[int, list[str], Counter[str]]:
@@ -27,10 +26,9 @@ def faults(seed: int) -> tuple[int, list[str], Counter[str]]:
 def test_gateways_of_twenty_thousand_fleets_agree_in_the_end() -> None:
     counts: Counter[str] = Counter()
     found = {}
-    with ProcessPoolExecutor(2) as pool:
-        for seed, violations, counted in pool.map(faults, range(FIRST, BEHIND), chunksize=50):
-            counts += counted
-            if violations:
-                found[seed] = violations
-    print(f"\n{dict(counts)}, seeds {FIRST} to {BEHIND - 1}")
+    for seed, violations, counted in play_all(faults, SEEDS):
+        counts += counted
+        if violations:
+            found[seed] = violations
+    print(dict(counts))
     assert found == {}

@@ -3,14 +3,13 @@
 `STOP_SEARCH=FROM:TO make soak` plays the episodes of other seeds.
 """
 
-import os
-
 import pytest
 
 from tests.fuzz.rules_removed import RULES
 from tests.fuzz.stop_search import explain, found_at, search
+from tests.support.soaks import seeds_from
 
-FIRST, BEHIND = (int(seed) for seed in os.environ.get("STOP_SEARCH", "1000:31000").split(":"))
+SEEDS = seeds_from("STOP_SEARCH", "1000:31000")
 WITHIN = 1200
 """Maximum number of episodes until the search finds the fault that a rule prevents."""
 RARE = {
@@ -26,8 +25,8 @@ RARE = {
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
 def test_thirty_thousand_episodes() -> None:
-    total = search(range(FIRST, BEHIND), processes=2)
-    print(f"\nseeds {FIRST} to {BEHIND - 1}\n{total}")
+    total = search(SEEDS, processes=2)
+    print(f"\nseeds {SEEDS.start} to {SEEDS.stop - 1}\n{total}")
     assert not total.failures, explain(total)
 
 
