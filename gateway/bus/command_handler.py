@@ -84,8 +84,7 @@ class CommandHandler:
         before = self._control.safety.persisted
         command, answer = self._carry_out(request)
         if request.query is not None:
-            now = self._control.safety.persisted
-            self._estop_sync.share(command, answer, before, now, by_wildcard=request.by_wildcard)
+            self._estop_sync.share(command, answer, before, self._control.safety, by_wildcard=request.by_wildcard)
             self._unanswered.append((request, command.id, answer))
         self._wake()
 

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Any, Final
 
 from gateway.control.commands import Answer, Command, EmergencyStop, Pause, Resume, Unpause
-from gateway.control.safety_state import PersistedSafety
+from gateway.control.safety_state import PersistedSafety, Safety
 from schemas import bus, keys, messages
 from schemas.backoff import backoff_s
 from schemas.commands import COMMANDS
@@ -57,7 +57,7 @@ MergeSafety = Callable[[PersistedSafety, str], object]
 Copy = pb.EstopCommand | pb.ResumeCommand | pb.PauseCommand | pb.UnpauseCommand
 
 
-def copy_for_others(command: Command, car: str, before: PersistedSafety, now: PersistedSafety) -> Copy | None:
+def copy_for_others(command: Command, car: str, before: PersistedSafety, now: Safety) -> Copy | None:
     """Return the command for all other gateways after one to `car` alone. None if it does not concern them.
 
     `before` and `now`: the state of this car before and after the command.
@@ -126,7 +126,7 @@ class EstopSync:
         self._changed.set()
 
     def share(
-        self, command: Command, answer: Answer, before: PersistedSafety, now: PersistedSafety, *, by_wildcard: bool
+        self, command: Command, answer: Answer, before: PersistedSafety, now: Safety, *, by_wildcard: bool
     ) -> None:
         """Let the other gateways know what a command has changed for the whole fleet.
 
@@ -160,8 +160,9 @@ class EstopSync:
             if not await self._is_changed_within(BATCH_RESET_S):
                 batches = 0
                 if not await self._is_changed_within(2.0 * ROUND_S * random.random()):  # noqa: S311 - no secret
-                    self._due |= set(random.sample(sorted(self._alive), min(1, len(self._alive))))
-                    self._changed.set()
+                    if not self._alive:
+                        continue
+                    self._due.add(random.choice(sorted(self._alive)))  # noqa: S311 - no secret
             batches += 1
             await asyncio.sleep(backoff_s(batches, BATCH_DELAY_S, MAX_BATCH_DELAY_S))
             if self._queries_all() and not first:

@@ -186,7 +186,6 @@ class RecordingEpisode:
         self.next_tick = self.now + 1.0
         self.gaps: dict[str, float] = {}
         self.newcomers: dict[str, str] = {}
-        self.since = self.now - age_s
         self.queue.clear()
         self.answers.clear()
 
@@ -260,7 +259,7 @@ class RecordingEpisode:
         gaps, self.gaps = self.gaps, {}
         newcomers, self.newcomers = self.newcomers, {}
         self.plan.add_gaps(gaps, self.polls[0], self.now)
-        self.plan.add_newcomers(newcomers, self.since, self.now)
+        self.plan.add_newcomers(newcomers, self.now)
 
     def ask(self, query: PlannedQuery, *, delay_s: float | None = None) -> None:
         """Send a query to the publishers' caches."""

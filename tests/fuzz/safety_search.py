@@ -51,7 +51,7 @@ SENDERS: Final = (
     ("script", Rank.SCRIPT),
     ("plan", Rank.COORDINATOR),
 )
-"""Those who send commands. In a table of people, ann and ben are leads, mia and tom drive, and guest is not listed."""
+"""The senders of commands. In a table of people, ann and ben are leads, mia and tom drive, and guest is not listed."""
 TABLE: Final = ("ann:lead", "ben:lead", "mia", "tom:other")
 EPOCH_NS: Final = 1_700_000_000_000_000_000
 COMMANDS_S: Final = 30.0
@@ -209,7 +209,7 @@ class SafetyEpisode:
                 node.due |= node.seen
                 self._sync(node)
             return
-        copy = copy_for_others(command, node.name, before, now)
+        copy = copy_for_others(command, node.name, before, node.control.safety)
         if copy is not None:
             self.after(
                 self.delay_s(),

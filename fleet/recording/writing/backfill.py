@@ -57,8 +57,7 @@ class Backfill:
         """When the thread ends at the latest."""
         self._thread = threading.Thread(target=self._run, name="recall")
         now = time.monotonic()
-        self._begin = now - (resumes_s or 0.0)
-        self._plan = BackfillPlan(now, resume_since=None if resumes_s is None else self._begin)
+        self._plan = BackfillPlan(now, resume_since=None if resumes_s is None else now - resumes_s)
 
     def start(self) -> None:
         """Start the thread."""
@@ -132,7 +131,7 @@ class Backfill:
             gaps, self._gaps = self._gaps, {}
             newcomers, self._newcomers = self._newcomers, {}
         self._plan.add_gaps(gaps, silent_since, now)
-        self._plan.add_newcomers(newcomers, self._begin, now)
+        self._plan.add_newcomers(newcomers, now)
 
     def _ask(self, queries: Iterable[PlannedQuery], *, is_last: bool = False) -> None:
         """Send these queries. If the recording ends, leave the rest to the last ones, and those when time is up."""

@@ -77,10 +77,9 @@ class BackfillPlan:
     def __init__(self, now: float, *, resume_since: float | None = None) -> None:
         """Begin. `resume_since`: the time from which to ask if this recording continues an interrupted session."""
         self._asked: dict[str, _Asked] = {}
-        if resume_since is None:
-            self._plan(EVERYTHING, now, QUERY_AFTER_START_S, now)
-        else:
-            self._plan(EVERYTHING, resume_since, (0.0, *QUERY_AFTER_START_S), now)
+        self._begin = now if resume_since is None else resume_since
+        at_once = () if resume_since is None else (0.0,)
+        self._plan(EVERYTHING, self._begin, (*at_once, *QUERY_AFTER_START_S), now)
 
     def add_gaps(self, gaps: Mapping[str, float], silent_since: float, now: float) -> None:
         """Plan queries for gaps: keys, each with the time of the last message before its gap.
@@ -96,13 +95,10 @@ class BackfillPlan:
         for key in gaps:
             self._asked[source_of(key)].keys.setdefault(key, 0)
 
-    def add_newcomers(self, sources: Mapping[str, str], since: float, now: float) -> None:
-        """Plan queries for keys whose senders have published before they were heard, each with the source to ask.
-
-        `since`: the begin of the recording.
-        """
+    def add_newcomers(self, sources: Mapping[str, str], now: float) -> None:
+        """Plan queries for keys whose senders have published before they were heard, each with the source to ask."""
         for source in set(sources.values()):
-            self._plan(source, since - GAP_MARGIN_S, QUERY_AFTER_NEWCOMER_S, now)
+            self._plan(source, self._begin - GAP_MARGIN_S, QUERY_AFTER_NEWCOMER_S, now)
         for key, source in sources.items():
             self._asked[source].keys.setdefault(key, 0)
 

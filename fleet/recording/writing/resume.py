@@ -33,7 +33,7 @@ class ResumePoint(Struct, frozen=True):
     since_ns: int
     """Time, by the recorder's clock, from which the new session accepts backfilled messages."""
     known: frozenset[tuple[str, int, int]] = frozenset()
-    """Messages recorded since then: key, sequence, identity (message_identity.py)."""
+    """Messages recorded since a few seconds before then: key, sequence, identity (message_identity.py)."""
     clocks: PublisherClocks = field(default_factory=PublisherClocks)
     """The publishers' clocks, as far as these messages show them."""
 

@@ -197,7 +197,8 @@ class SessionWriter:
         tracker = self._trackers.get(key)
         was_missing = tracker is not None and tracker.is_missing(sender, sequence)
         # A message in a gap belongs to this session, whatever the clocks say.
-        if self._clocks.received_ns(key, published_ns) < self.resume_since_ns and not was_missing:
+        live_ns = self._clocks.received_ns(key, published_ns)
+        if live_ns < self.resume_since_ns and not was_missing:
             return False  # or its clock is slow, and nothing has shown that yet
         if received_ns <= self._asked_until_ns:
             self._asked.add(sender[0])
@@ -215,13 +216,13 @@ class SessionWriter:
         known = state.tracker.senders[sender]
         # A gap behind an answer that broke off begins at its last message, not when it was received. The clock of the
         # publisher may be ahead.
-        known.heard_ns = known.heard_ns or min(self._clocks.received_ns(key, published_ns), received_ns)
+        known.heard_ns = known.heard_ns or min(live_ns, received_ns)
         if was_missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
         elif len(known.gaps) > gaps_before:  # the answer did not go back far enough
             self._request(key, known)
         if before is None:
-            self._note_newcomer(key, sender, sequence, self._clocks.received_ns(key, published_ns))
+            self._note_newcomer(key, sender, sequence, live_ns)
         self._write((state, received_ns, payload, published_ns, sequence))
         return True
 

@@ -27,9 +27,9 @@ ROUTED_AFTER_S = 0.5
 STATE, EVENT = "fleet/blue/state/link", "fleet/blue/event/command"
 
 
-def started() -> BackfillPlan:
+def started(at: float = NOW - 10.0) -> BackfillPlan:
     """Return a plan that has asked what it asks at the start."""
-    plan = BackfillPlan(NOW - 10.0)
+    plan = BackfillPlan(at)
     answer(plan, plan.due_queries(NOW))
     assert not plan.last_queries()
     return plan
@@ -101,7 +101,7 @@ def test_car_that_did_not_answer_is_asked_again_since_its_first_gap(cause: str) 
 
 def test_newcomer_is_asked_for_everything_since_the_begin() -> None:
     plan = started()
-    plan.add_newcomers({STATE: "fleet/blue", EVENT: "fleet/blue"}, NOW - 10.0, NOW)
+    plan.add_newcomers({STATE: "fleet/blue", EVENT: "fleet/blue"}, NOW)
     query = PlannedQuery("fleet/blue", NOW - 10.0 - GAP_MARGIN_S)
     assert asked_at(plan, NOW + 10.0, STATE, EVENT) == [(after, query) for after in QUERY_AFTER_NEWCOMER_S]
     assert not plan.last_queries()
@@ -109,9 +109,9 @@ def test_newcomer_is_asked_for_everything_since_the_begin() -> None:
 
 def test_first_stop_of_a_fleet_asks_for_the_events_alone() -> None:
     """The window since the begin is for these keys, also if all cars are asked for the last seconds at that time."""
-    plan = started()
+    plan = started(NOW - 1000.0)
     events = [f"fleet/car{number}/event/command" for number in range(2 * MAX_SINGLE_SOURCES)]
-    plan.add_newcomers({each: each for each in events}, NOW - 1000.0, NOW)
+    plan.add_newcomers({each: each for each in events}, NOW)
     plan.add_reconnect(NOW - 1.0, NOW - QUERY_AFTER_RECONNECT_S[0])
     asked = plan.due_queries(NOW)
     assert asked[0] == PlannedQuery(EVERYTHING, NOW - 1.0)
