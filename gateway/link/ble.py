@@ -20,7 +20,7 @@ from bleak.backends.device import BLEDevice
 from bleak.backends.scanner import AdvertisementData
 from bleak.backends.service import BleakGATTService
 
-from gateway.link import ble_adapter_turns
+from gateway.link import ble_adapter_turns, bluez
 from gateway.link.base import Device, Link, LinkKind
 from gateway.link.ble_adapter_turns import ConnectionNote, Turn
 from gateway.link.ble_devices import list_devices
@@ -113,7 +113,8 @@ class BleLink(BufferedLink):
 
     async def _search(self) -> _Devices:
         """Return the device as each adapter knows it. Empty if an existing connection was taken over."""
-        connections = await ble_adapter_turns.list_connections()
+        await bluez.give_bleak_missed_objects()
+        connections = await bluez.list_connections()
         adapters = self._allowed(list(connections))
         # A killed gateway leaves its module connected, and a scan does not find connected modules. So look at the
         # connected ones, on all adapters: the module may be connected to an adapter that is no longer allowed.
@@ -199,7 +200,7 @@ class BleLink(BufferedLink):
                     try:
                         return await _within(timeout_s, self._use(devices[adapter], adapter))
                     except (CannotOpen, TimeoutError) as error:
-                        connections = (await ble_adapter_turns.list_connections()).get(adapter or "", 0)
+                        connections = (await bluez.list_connections()).get(adapter or "", 0)
                         if isinstance(error, Busy) or adapter is None or connections < SMALL_ADAPTER_CONNECTIONS:
                             raise
                         if await self._free(adapter):
@@ -219,16 +220,16 @@ class BleLink(BufferedLink):
     async def _take_turn(self, turns: dict[str | None, Turn]) -> str | None:
         """Wait for the turn at an adapter with room, or at the last one that is left. Return its name."""
         self._stage = "other gateways connect through this adapter, and it was not this one's turn"
-        connections = await ble_adapter_turns.list_connections()
+        connections = await bluez.list_connections()
         while True:
             for adapter in sorted(turns, key=lambda each: connections.get(each or "", 0)):
                 if not turns[adapter].try_take():
                     continue
                 # Nobody else connects now, so the number of connections does not grow. The last adapter is tried even
                 # if it has ADAPTER_CONNECTIONS, because some can hold more.
-                connections = await ble_adapter_turns.list_connections()
+                connections = await bluez.list_connections()
                 if connections.get(adapter or "", 0) >= ADAPTER_CONNECTIONS and await self._free(adapter):
-                    connections = await ble_adapter_turns.list_connections()
+                    connections = await bluez.list_connections()
                 if len(turns) == 1 or connections.get(adapter or "", 0) < ADAPTER_CONNECTIONS:
                     return adapter
                 turns.pop(adapter).release()

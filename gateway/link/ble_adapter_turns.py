@@ -7,24 +7,16 @@ gateway takes a second lock, the lane. While the lane is taken, other gateways d
 turn. A stop is a write on an open link, and never waits.
 """
 
-import asyncio
 import contextlib
-import sys
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
+from gateway.link import bluez
 from schemas.process.file_lock import FileLock
 from schemas.state_dir import default_directory
 
-if sys.platform == "linux":  # there, bleak installs dbus_fast
-    from dbus_fast import BusType, Message
-    from dbus_fast.aio import MessageBus
-
 TURN_POLL_S: Final = 0.05
 """Interval of the attempts to take a turn."""
-LIST_TIMEOUT_S: Final = 3.0
-"""Timeout for BlueZ to list its devices."""
-_BLUEZ: Final = "org.bluez"
 
 
 class Turn:
@@ -84,58 +76,9 @@ class ConnectionNote:
 
     async def disconnect(self) -> None:
         """End the connection of a gateway that has ended."""
-        await disconnect(self.adapter, self.address)
+        await bluez.disconnect(self.adapter, self.address)
         self.remove()
 
 
 def _directory(directory: Path | None) -> Path:
     return (default_directory() if directory is None else directory) / "bluetooth"
-
-
-async def list_connections() -> dict[str, int]:
-    """Return the powered adapters in order, each with its number of connections. Empty if that is unknown."""
-    if sys.platform != "linux":
-        return {}
-    found: dict[str, Any] = {}
-    with contextlib.suppress(Exception):  # whatever D-Bus raises, because bleak reports the fault better
-        async with asyncio.timeout(LIST_TIMEOUT_S):
-            found = await _managed_objects()
-    adapters = {path for path, each in found.items() if _value(each, "Adapter1", "Powered") is True}
-    devices = [_value(each, "Device1", "Adapter") for each in found.values() if _value(each, "Device1", "Connected")]
-    ordered = sorted(adapters, key=lambda path: (len(path), path))  # hci10 comes after hci9
-    return {path.rpartition("/")[2]: devices.count(path) for path in ordered}
-
-
-async def disconnect(adapter: str, address: str) -> None:
-    """End the connection of an adapter to a device. Ignore errors, because they mean that there is no connection."""
-    if sys.platform != "linux":
-        return
-    path = f"/org/bluez/{adapter}/dev_{address.upper().replace(':', '_')}"
-    with contextlib.suppress(Exception):
-        async with asyncio.timeout(LIST_TIMEOUT_S):
-            await _call(path, f"{_BLUEZ}.Device1", "Disconnect")
-
-
-async def _managed_objects() -> dict[str, Any]:
-    (found,) = await _call("/", "org.freedesktop.DBus.ObjectManager", "GetManagedObjects")
-    return dict(found)
-
-
-async def _call(path: str, interface: str, member: str) -> list[Any]:
-    """Call BlueZ. Raises whatever D-Bus raises."""
-    connection = MessageBus(bus_type=BusType.SYSTEM)
-    try:
-        await connection.connect()
-        message = Message(destination=_BLUEZ, path=path, interface=interface, member=member)
-        answer = await connection.call(message)
-    finally:
-        connection.disconnect()
-    if answer.error_name:
-        raise OSError(f"BlueZ refused {member}")
-    return list(answer.body)
-
-
-def _value(interfaces: Any, interface: str, name: str) -> Any:
-    """Return a property of an object. None if it has no such interface or property."""
-    found = interfaces.get(f"{_BLUEZ}.{interface}", {}).get(name)
-    return None if found is None else found.value

@@ -120,6 +120,8 @@ class Module:
     """The adapter that is connected to it."""
     seen_by: frozenset[str] | None = None
     """The adapters in whose range it is; None for all."""
+    found_after_list: bool = False
+    """True if another program's scan finds it just after BlueZ has listed its objects to a program that listens."""
     notified: set[tuple["_Caller", str]] = field(default_factory=set)
     """The subscribers of notifications, each with its characteristic."""
     pieces: list[bytes] = field(default_factory=list)
@@ -301,7 +303,8 @@ class FakeBluez:
         except Refused as error:
             await caller.send(_error(message, *error.args))
         else:
-            await caller.send(Message.new_method_return(message, signature, body))
+            listed = message.member == "GetManagedObjects" and caller.rules
+            await caller.send(Message.new_method_return(message, signature, body), *(self._found() if listed else ()))
 
     def _bus_call(self, caller: "_Caller", message: Message) -> tuple[str, list[Any]]:
         if message.member == "Hello":
@@ -317,16 +320,7 @@ class FakeBluez:
             return
         for caller in list(self._callers):
             if caller.wants(path, interface, member, body):
-                await caller.send(
-                    Message(
-                        message_type=MessageType.SIGNAL,
-                        path=path,
-                        interface=interface,
-                        member=member,
-                        signature=signature,
-                        body=body,
-                    )
-                )
+                await caller.send(_signal(path, interface, member, signature, body))
 
     # ------------------------------------------------------------------ BlueZ
 
@@ -446,6 +440,14 @@ class FakeBluez:
                 else:
                     await self._change(path, DEVICE, {"RSSI": Variant("n", -50)})
 
+    def _found(self) -> Iterator[Message]:
+        """Let all adapters see the modules that are found after a list. Yield the signals of that."""
+        for module in (each for each in self.modules if each.found_after_list):
+            for adapter in self.adapters:
+                module.known.add(adapter.name)
+                body = [module.path_at(adapter.name), self._device(module, adapter)]
+                yield _signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", body)
+
     async def _hung_up(self, module: Module) -> None:
         path, gone = module.path, list(self._gatt(module))
         module.adapter = None
@@ -540,9 +542,11 @@ class _Caller:
 
         return any(fits(rule) for rule in self.rules)
 
-    async def send(self, message: Message) -> None:
-        message.serial, message.sender = self.serials(), BLUEZ
-        self.writer.write(bytes(message._marshall(False)))
+    async def send(self, *messages: Message) -> None:
+        """Send messages, which arrive at once."""
+        for message in messages:
+            message.serial, message.sender = self.serials(), BLUEZ
+        self.writer.write(b"".join(bytes(message._marshall(False)) for message in messages))
         with contextlib.suppress(ConnectionError):
             await self.writer.drain()
 
@@ -565,6 +569,12 @@ async def _received(reader: asyncio.StreamReader) -> Message:
     message = Unmarshaller(io.BytesIO(head + rest)).unmarshall()  # type: ignore[arg-type]  # any reader will do
     assert message is not None
     return message
+
+
+def _signal(path: str, interface: str, member: str, signature: str, body: list[Any]) -> Message:
+    return Message(
+        message_type=MessageType.SIGNAL, path=path, interface=interface, member=member, signature=signature, body=body
+    )
 
 
 def _error(call: Message, name: str, words: str) -> Message:

@@ -140,6 +140,15 @@ async def test_by_name(peer: BlePeer) -> None:
     assert f"{peer.module.address} (BT04), {peer.bluez.modules[1].address} (BT05). (waited 3 s)" in words
 
 
+@pytest.mark.parametrize("named", [False, True])
+async def test_module_found_while_bleak_starts_is_not_missed(peer: BlePeer, *, named: bool) -> None:
+    peer.module.found_after_list = True
+    link = await open_link(BleUrl(name="BT04") if named else peer.url, timeout_s=PATIENCE_S)
+    peer.send(READING)
+    assert await read(link, len(READING)) == READING
+    await link.close()
+
+
 async def test_of_several_with_one_name_none_is_taken(peer: BlePeer) -> None:
     """Another gateway is connected to one of them. The connected module does not advertise, but counts."""
     first = await open_link(peer.url)

@@ -4,14 +4,14 @@ import asyncio
 import os
 import subprocess
 import sys
-import time
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 
 from gateway.link import CannotOpen, Link, LinkUrl, open_link
-from gateway.link.ble_adapter_turns import Turn, list_connections
+from gateway.link.ble_adapter_turns import Turn
+from gateway.link.bluez import list_connections
 from schemas.bluetooth import ADAPTER_CONNECTIONS
 from schemas.links import BleUrl
 from schemas.process.file_lock import FileLock
@@ -28,7 +28,6 @@ if sys.platform == "linux":
 STOP = b"$0,0,0,0,0,0,0,0,0#"
 PATIENCE_S = 20.0
 CARS = 8
-ALL_CONNECTED_S = 25.0
 
 
 @pytest.fixture
@@ -227,21 +226,17 @@ def fleet(tmp_path: Path, two_adapters: BlePeer) -> Iterator[FleetProcesses]:
     started.close()
 
 
-def test_eight_gateways_connect_in_time_and_killed_one_frees_place(
-    fleet: FleetProcesses, two_adapters: BlePeer
-) -> None:
+def test_eight_gateways_connect_and_killed_one_frees_place(fleet: FleetProcesses, two_adapters: BlePeer) -> None:
     hci0, hci1 = two_adapters.bluez.adapters
     more(two_adapters, 1, hci0)
     more(two_adapters, 1, hci1)
     cars = more(two_adapters, CARS)
-    began = time.monotonic()
     gateways = [
         fleet.gateway(f"ble://{each.address}?adapter=auto", "--retry", car=f"car{number}")
         for number, each in enumerate(cars)
     ]
-    wait_for(lambda: all(each.connected for each in cars), "all are connected", ALL_CONNECTED_S)
+    wait_for(lambda: all(each.connected for each in cars), "all are connected")
     wait_for(lambda: all("[link_open]" in each.stderr for each in gateways), "and open")
-    assert time.monotonic() - began < ALL_CONNECTED_S
     assert hci0.refused == hci1.refused == []
     assert [sum(each.adapter is adapter for each in two_adapters.bluez.modules) for adapter in (hci0, hci1)] == [5, 5]
     gateways[0].kill()

@@ -268,7 +268,7 @@ def test_bluetooth_devices_are_listed_likely_cars_first(monkeypatch: pytest.Monk
     from tests.support.bluez import BATTERY, FFF0, NORDIC, Adapter, FakeBluez, Module, free_address
 
     other = Module(free_address(), "Head\x1b[2Jset", BATTERY)
-    car, nordic = Module(free_address(), "BT04"), Module(free_address(), "UART", NORDIC)
+    car, nordic = Module(free_address(), "BT04"), Module(free_address(), "UART", NORDIC, found_after_list=True)
     clone = Module(free_address(), "Ebyte", FFF0, seen_by=frozenset({"hci1"}))
     bluez = FakeBluez(other, car, nordic, clone, adapters=[Adapter("hci0"), Adapter("hci1")])
     monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", bluez.address)
