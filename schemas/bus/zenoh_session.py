@@ -427,7 +427,7 @@ class Bus:
             with self._lock:
                 if expression in self._alive and link in ("", answered_over):
                     return sorted(self._alive[expression])
-            if not link and monotonic() < link_end:
+            if not link and monotonic() < link_end and not self._closing.is_set():
                 self._closing.wait(_LINK_POLL_S)
                 continue
             with self.while_open():

@@ -157,6 +157,15 @@ def test_tokens_after_a_lost_link(endpoint: str) -> None:
         assert watcher.tokens("fleet/*") == ["fleet/red"]
 
 
+def test_tokens_of_closed_session_are_refused_at_once(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It waited 2 s for a link, without a pause."""
+    monkeypatch.setattr(zenoh_session, "LINK_TIMEOUT_S", 10 * processes.PATIENCE_S)
+    with bus.Bus.open(endpoint) as closed:
+        pass
+    with pytest.raises(bus.BusError, match="closed"):
+        closed.tokens("*/*", 10 * processes.PATIENCE_S)
+
+
 def test_tokens_do_not_wait_for_callbacks(endpoint: str) -> None:
     """On a busy machine, a callback ran after the answer over a new link. Then that answer lacked watched tokens."""
     proxy = TcpProxy(int(endpoint.rpartition(":")[2]))
