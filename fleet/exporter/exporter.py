@@ -18,6 +18,9 @@ from fleet.exporter.metrics import CONNECTED, DROPS, METRICS, Metric, MetricKind
 DEFAULT_EXPORTER_PORT: Final = 9478
 _WAIT_S: Final = 0.25
 """Maximum time until the exporter notices that it has to end."""
+TOKENS_AFTER_LINK_S: Final = 2.0
+"""Time after the link to the hub is back, for the gateways' own links to come back, and for the tokens to arrive: other
+clients reconnect within half a second, or later on a loaded machine."""
 _TOPICS: Final = ("state/*", "sensor/battery")
 """The exporter subscribes to these topics, and queries them when a car appears. Of the readings, it takes only those of
 the battery: in the mode `tracking`, a car sends others 27 times a second."""
@@ -37,6 +40,7 @@ class Exporter(Collector):
         self._metrics = FleetMetrics()
         self._lock = threading.Lock()
         self._inbox.subscribe(f"{client.name}/{STATUS}")
+        self._link, self._link_began = "", 0.0
 
     def serve(self, address: str, port: int) -> tuple[int, Callable[[], None]]:
         """Serve the metrics. Return the port, and a function that ends the server.
@@ -61,6 +65,8 @@ class Exporter(Collector):
                 # Wait without the lock, because a scrape must not wait for a message.
                 heard = self._inbox.hear(_WAIT_S, pool)
                 with self._lock:
+                    if (link := self._client.bus.link) != self._link:
+                        self._link, self._link_began = link, heard.now
                     for car, alive in heard.gateways.items():
                         self._metrics.observer.on_token(car, heard.now, alive=alive)
                     for sample, wall_s in heard.samples:
@@ -73,7 +79,9 @@ class Exporter(Collector):
         families[CONNECTED.name].add_metric((), float(self._client.bus.connected))
         families[DROPS.name].add_metric((), self._inbox.dropped)
         with self._lock:
-            for metric, labels, value in self._metrics.values(time.monotonic()):
+            now, link = time.monotonic(), self._client.bus.link
+            sees_gateways = link == self._link != "" and now >= self._link_began + TOKENS_AFTER_LINK_S
+            for metric, labels, value in self._metrics.values(now, sees_gateways=sees_gateways):
                 families[metric.name].add_metric(labels, value)
         yield from families.values()
 

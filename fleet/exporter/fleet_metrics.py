@@ -63,14 +63,18 @@ class FleetMetrics:
             for labels in [each for each in counter if each[0] not in self.observer.states]:
                 del counter[labels]
 
-    def values(self, now: float) -> Iterator[Sampled]:
-        """Yield all values."""
+    def values(self, now: float, *, sees_gateways: bool = True) -> Iterator[Sampled]:
+        """Yield all values.
+
+        `sees_gateways` is False while the link to the hub is lost, and while tokens may be missing after it is back. A
+        gateway that is not seen then may be there, so nothing is said of its car.
+        """
         cars = sorted(self.observer.snapshot(()).cars)[:MAX_EXPORTED_CARS]
         for name in cars:
             if (state := self.observer.states.get(name)) is None:
                 continue
             for metric in CAR_METRICS:
-                if state.present or metric.of_absent:
+                if state.present or (metric.of_absent and sees_gateways):
                     for labels, value in metric.values(state, now):
                         yield metric, (name, *labels), value
         for command, count in sorted(self._commands.items()):

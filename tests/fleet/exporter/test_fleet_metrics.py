@@ -62,6 +62,7 @@ def test_stale_metric_has_no_value_and_gone_gateway_is_down() -> None:
     assert found(metrics, late)["fleet_car_ready", "red"] == 0
     metrics.observer.on_token("red", late, alive=False)
     assert found(metrics, late) == {("fleet_car_up", "red"): 0}
+    assert [*metrics.values(late, sees_gateways=False)] == []
 
 
 def test_each_command_phase_counts_once_with_closed_labels() -> None:
