@@ -30,11 +30,12 @@ LONG_S = 60.0
 
 
 SHORTEST_POLL_S = 0.01
-LONGEST_POLL_S = 0.05
+LONGEST_POLL_S = 0.2
 POLL_SHARE = 0.05
 """Poll interval of a wait, as a share of the time that has passed.
 
-A poll may be a query of the bus. With four workers, a hundred polls a second by each took half of two processors.
+A poll may be a query of the bus. With four workers, a hundred polls a second by each took half of two processors. With
+eleven, twenty a second by each still took a tenth of them.
 """
 
 

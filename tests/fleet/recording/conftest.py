@@ -1,7 +1,5 @@
 import subprocess
-import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import pytest
 import zenoh
@@ -10,19 +8,7 @@ from schemas import keys
 from schemas.bus import Bus, Publisher, router_config
 from schemas.topics import TOPICS
 from tests.support.ports import free_endpoint
-from tests.support.processes import FleetProcesses
-
-
-def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = 30.0) -> Any:
-    deadline = time.monotonic() + timeout_s
-    while True:
-        value = condition()
-        if value:
-            return value
-        if time.monotonic() > deadline:
-            pytest.fail(f"{what}: not within {timeout_s:g} s")
-        time.sleep(0.01)
-
+from tests.support.processes import FleetProcesses, wait_for
 
 _started: list["subprocess.Popen[str]"] = []
 

@@ -20,8 +20,9 @@ from schemas import keys
 from schemas.bus import Bus
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import PinCause
-from tests.fleet.recording.conftest import heard, popen, publisher, wait_for
+from tests.fleet.recording.conftest import heard, popen, publisher
 from tests.support import in_process
+from tests.support.processes import wait_for
 from tests.support.text_parts import has_parts
 
 RECORD = "from fleet.commands.record import record; record()"

@@ -21,11 +21,12 @@ from fleet.recording.writing.disk_space import MB, Reserve
 from fleet.recording.writing.session_writer import Options, SessionWriter
 from schemas.bus import Bus, Failure, Sample
 from schemas.gen import fleet_v1_pb2 as pb
-from tests.fleet.recording.conftest import heard, popen, publisher, wait_for
+from tests.fleet.recording.conftest import heard, popen, publisher
 from tests.fleet.recording.test_record_command import ready
 from tests.fleet.recording.writing.test_session_writer import BEGUN_NS, SECOND_NS, feed
 from tests.support import in_process
 from tests.support.disk import DISKS, MAY_MOUNT, disk
+from tests.support.processes import wait_for
 from tests.support.text_parts import has_parts
 
 pytestmark = pytest.mark.xdist_group("disk")  # these tests fill the same disk

@@ -8,7 +8,7 @@ import zenoh
 
 from fleet.recording.writing.backfill import Backfill
 from schemas.bus import Bus
-from tests.fleet.recording.conftest import wait_for
+from tests.support.processes import wait_for
 
 SLOW_S = 1.5
 

@@ -30,8 +30,9 @@ from schemas.bus import Bus, Publisher, Sample, router_config
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.topics import TOPICS
 from schemas.words import RecorderState, RecorderVerb
-from tests.fleet.recording.conftest import heard, publisher, wait_for
+from tests.fleet.recording.conftest import heard, publisher
 from tests.support.ports import free_endpoint
+from tests.support.processes import wait_for
 from tests.support.tap import Tap
 
 
@@ -138,7 +139,7 @@ def test_sequence_gaps_are_counted_and_restart_is_none(endpoint: str, bus: Bus, 
         # Publishers without a cache cannot backfill. One skips two numbers, another one begins anywhere and wraps.
         for numbers in ((0, 1, 4, 5), (0xFFFFFFFE, 0xFFFFFFFF, 0)):
             with stranger.declare_publisher(key) as out:
-                wait_for(lambda out=out: out.matching_status.matching, "a subscriber")  # type: ignore[misc]  # zenoh's stub: a bool
+                wait_for(lambda out=out: out.matching_status.matching, "a subscriber")
                 for number in numbers:
                     out.put(b"", source_info=zenoh.SourceInfo(out.id, number))
         heard(stranger)

@@ -16,8 +16,8 @@ from schemas import messages
 from schemas.bus import Bus, Sample, messages_of
 from schemas.gen import fleet_v1_pb2 as pb
 from schemas.words import RecorderState, RecorderVerb
-from tests.fleet.recording.conftest import wait_for
 from tests.support import in_process
+from tests.support.processes import wait_for
 
 
 @pytest.mark.parametrize(
