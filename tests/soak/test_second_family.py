@@ -1,12 +1,12 @@
 """Twenty thousand episodes with cars of the second family. The seeds change each day; FUZZ_SEED repeats a run."""
 
 import os
-from concurrent.futures import ProcessPoolExecutor
 from datetime import UTC, datetime
 
 import pytest
 
 from tests.fuzz import ugv_search
+from tests.support.soaks import play_all
 
 SEED = int(os.environ.get("FUZZ_SEED", datetime.now(UTC).strftime("%Y%m%d"))) * 100_000
 EPISODES = 20_000
@@ -20,7 +20,6 @@ def faults(seed: int) -> tuple[int, list[str], int, int]:
 
 @pytest.mark.soak
 def test_twenty_thousand_episodes() -> None:
-    with ProcessPoolExecutor() as pool:
-        found = list(pool.map(faults, range(SEED, SEED + EPISODES), chunksize=100))
-    print(f"\n{sum(each[2] for each in found)} drives, {sum(each[3] for each in found)} shown, seeds from {SEED}")
+    found = list(play_all(faults, range(SEED, SEED + EPISODES)))
+    print(f"{sum(each[2] for each in found)} drives, {sum(each[3] for each in found)} shown")
     assert {seed: words for seed, words, _, _ in found if words} == {}
