@@ -215,7 +215,7 @@ class RecordingEpisode:
         self.answers = [each for each in self.answers if each[0] > self.now]
         for _, query, found, is_whole in ready:
             for each in found:
-                self.session.add_backfilled(cast("Any", each), self.now_ns)
+                self.session.add_backfilled(cast("Any", each), self.now_ns, is_of_all=self.plan.asks_for_all(query))
             if is_whole:
                 self.plan.add_answers(query, {each.key_expr for each in found})
         if self.session.gaps:

@@ -14,6 +14,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import repeat
 from math import inf
 from typing import Final
 
@@ -51,7 +52,7 @@ class Backfill:
         """Keys with the time from which messages are missing, s, monotonic."""
         self._newcomers: dict[str, str] = {}
         """Keys with the source to ask."""
-        self._answers: list[zenoh.Sample] = []
+        self._answers: list[tuple[zenoh.Sample, bool]] = []
         self._closing = threading.Event()
         self._until = inf
         """When the thread ends at the latest."""
@@ -97,8 +98,11 @@ class Backfill:
         with self._lock:
             self._newcomers.update((key, source) for key, source in sources.items() if _has_cache(key))
 
-    def take_answers(self) -> list[zenoh.Sample]:
-        """Return the answers since the last call. Some may be recorded already."""
+    def take_answers(self) -> list[tuple[zenoh.Sample, bool]]:
+        """Return the answers since the last call. Some may be recorded already.
+
+        Each comes with True if its sender was asked for everything since the begin of the recording.
+        """
         with self._lock:
             found, self._answers = self._answers, []
         return found
@@ -141,11 +145,11 @@ class Backfill:
             for expression in self._all if query.source == EVERYTHING else (f"{query.source}/**",):
                 if time.monotonic() >= self._until or (self._closing.is_set() and not is_last):
                     return
-                is_whole &= self._recall(expression, query.since, answered, is_last=is_last)
+                is_whole &= self._recall(expression, query, answered, is_last=is_last)
             if is_whole:
                 self._plan.add_answers(query, answered)
 
-    def _recall(self, expression: str, since: float, answered: set[str], *, is_last: bool) -> bool:
+    def _recall(self, expression: str, query: PlannedQuery, answered: set[str], *, is_last: bool) -> bool:
         """Fetch the messages, and add their keys to `answered`. Return False if this was cut short."""
         found: list[zenoh.Sample] = []
         is_whole, own = True, self._bus.id
@@ -153,14 +157,14 @@ class Backfill:
         # window of the next one would be too short.
         now = time.monotonic()
         timeout_s = min(RECALL_TIMEOUT_S, max(self._until - now, MIN_QUERY_TIMEOUT_S))
-        for sample in self._bus.recall(expression, now - since, timeout_s=timeout_s):
+        for sample in self._bus.recall(expression, now - query.since, timeout_s=timeout_s):
             found.append(sample)
             has_room = len(found) + len(self._answers) <= MAX_ANSWERS
             if not has_room or (self._closing.is_set() and not is_last):  # the last queries ask for the rest
                 is_whole = False
                 break
         with self._lock:
-            self._answers += found
+            self._answers += zip(found, repeat(self._plan.asks_for_all(query)))
         # A recorder publishes, too. Its own answer says nothing about the recorder of another site.
         answered.update(str(each.key_expr) for each in found if session_of(each) != own)
         return is_whole

@@ -137,6 +137,10 @@ class BackfillPlan:
             if not asked.due:
                 del self._asked[source]
 
+    def asks_for_all(self, query: PlannedQuery) -> bool:
+        """Return True if a query asks a car, or all, for everything since the begin of the recording."""
+        return query.since <= self._begin and source_of(query.source) == query.source
+
     def _plan(self, source: str, since: float, after: Sequence[float], now: float) -> None:
         if not after:
             return

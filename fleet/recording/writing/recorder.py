@@ -366,11 +366,12 @@ class Recorder:
                     mark: Any = messages.parse(MARK_TOPIC.message, payload, str(encoding))
                     self._session.mark(mark.message[:MAX_MARK_CHARACTERS], mark.name[:MAX_MARK_CHARACTERS], received_ns)
 
-    def _add_backfilled(self, samples: Sequence[zenoh.Sample], answered_ns: int) -> None:
+    def _add_backfilled(self, answers: Sequence[tuple[zenoh.Sample, bool]], answered_ns: int) -> None:
         """Write answers of publishers. `answered_ns` is when they were taken: later messages wait in the queue."""
         late: list[tuple[int, str, str, bytes]] = []
-        for sample in samples:
-            new, key = self._session.add_backfilled(sample, answered_ns), str(sample.key_expr)
+        for sample, is_of_all in answers:
+            new = self._session.add_backfilled(sample, answered_ns, is_of_all=is_of_all)
+            key = str(sample.key_expr)
             if new and sample.timestamp is not None and self._pin_watch.is_watched(key):
                 published_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
                 late.append((published_ns, key, str(sample.encoding), sample.payload.to_bytes()))

@@ -32,7 +32,6 @@ from fleet.recording.writing.segment_counts import KeyState, Row, SegmentCounts
 from fleet.recording.writing.segment_writer import Segment
 from schemas import messages
 from schemas.bus import sequence_of
-from schemas.bus.zenoh_session import RECALL_TIMEOUT_S
 
 MAX_BUFFERED_MESSAGES: Final = 100_000
 MAX_BUFFERED_BYTES: Final = 64 * MB
@@ -104,13 +103,12 @@ class SessionWriter:
         self.newcomers: dict[str, str] = {}
         """Keys of senders whose first messages were not heard, perhaps because they had no link, each with the source
         to ask. The recorder requests a backfill for them and clears them."""
-        self._asked_until_ns = now_ns + NEWCOMER_AFTER_NS + int(RECALL_TIMEOUT_S * 1e9)
         self._asked: set[Hashable] = set()
-        """Zenoh sessions that have answered until then: at the start, they were asked for all since the begin."""
+        """Zenoh sessions that have answered when they were asked for everything since the begin."""
         if after is not None:
             self._trackers = {key: tracker.following() for key, tracker in after._trackers.items()}
             self.gaps, self.newcomers = after.gaps, after.newcomers
-            self._asked_until_ns, self._asked = after._asked_until_ns, after._asked
+            self._asked = after._asked
         self._drops: dict[str, int] = {}
         """Lost messages by key: those that did not fit on the disk, and those without a number that did not fit into
         the queue."""
@@ -183,9 +181,10 @@ class SessionWriter:
         else:
             self._put(state.channel, received_ns, payload, published_ns, sequence)
 
-    def add_backfilled(self, sample: zenoh.Sample, received_ns: int) -> bool:
+    def add_backfilled(self, sample: zenoh.Sample, received_ns: int, *, is_of_all: bool = False) -> bool:
         """Write a backfilled publication.
 
+        `is_of_all`: its sender was asked for everything since the begin of the recording.
         Return False if it is recorded already, is older than the session, or has no number or no time.
         """
         source, stamp = sample.source_info, sample.timestamp
@@ -200,7 +199,7 @@ class SessionWriter:
         live_ns = self._clocks.received_ns(key, published_ns)
         if live_ns < self.resume_since_ns and not was_missing:
             return False  # or its clock is slow, and nothing has shown that yet
-        if received_ns <= self._asked_until_ns:
+        if is_of_all:
             self._asked.add(sender[0])
         state = self._states.get(key)
         if state is None or state.encoding != sample.encoding:

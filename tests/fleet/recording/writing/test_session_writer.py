@@ -245,7 +245,7 @@ def test_first_event_of_a_car_that_answered_at_once_asks_for_its_key_alone(inter
     answer: Any = SimpleNamespace(
         key_expr="fleet/red/state/link", payload=zenoh.ZBytes(b"{}"), encoding=JSON, timestamp=stamp, source_info=source
     )
-    assert not tape.add_backfilled(answer, BEGUN_NS + SECOND_NS)
+    assert not tape.add_backfilled(answer, BEGUN_NS + SECOND_NS, is_of_all=True)
     after = SessionWriter(tmp_path, "fleet", Options(), BEGUN_NS + SECOND_NS, after=tape)
     tape.close(BEGUN_NS + SECOND_NS)
     for car, sender in zip(("red", "blue"), events, strict=True):
