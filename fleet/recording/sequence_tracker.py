@@ -161,9 +161,7 @@ class SequenceTracker:
             self._skip(known, known.last, ahead)
             known.last = number
             self._expect(sender, number, content)
-        elif self._precede(known, number):
-            pass
-        elif not known.fill(number):
+        elif not (self._precede(known, number) or known.fill(number)):
             return False
         elif (sender, known.last) in self._early:  # the original of a newer one has not arrived, so this one's may
             self._expect(sender, number, content)

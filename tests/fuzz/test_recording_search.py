@@ -45,3 +45,13 @@ def test_gap_behind_an_answer_that_broke_off_is_asked_for(tmp_path: Path) -> Non
 def test_gap_that_an_answer_shows_is_asked_for(tmp_path: Path) -> None:
     """In this recording, an answer does not go back to the message before it, and the next one follows it."""
     assert play(693, tmp_path).violations == []
+
+
+def test_original_behind_two_answers_is_not_written_again(tmp_path: Path) -> None:
+    """In this recording, an older message is in the second of two answers, and all originals come after them."""
+    assert play(8462, tmp_path).violations == []
+
+
+def test_answer_about_a_reconnect_is_none_about_the_whole_recording(tmp_path: Path) -> None:
+    """In this recording, a car answers at once, but it was asked only for what came after a reconnect."""
+    assert play(7372, tmp_path).violations == []

@@ -66,6 +66,13 @@ def test_gap_among_backfilled_messages_is_not_written_again_when_it_arrives() ->
     assert numbers._early == {}, "its original can arrive no more"
 
 
+def test_original_of_an_older_backfilled_message_is_a_duplicate() -> None:
+    """An answer that went further back came behind another one, and then the originals of both."""
+    numbers = SequenceTracker()
+    assert all(numbers.add_backfilled("a", number, number * 10) for number in (2, 1, 3))
+    assert live(numbers, 1, 2, 3, 4) == [False, False, False, True]
+
+
 def test_message_before_backfilled_ones_is_no_restart() -> None:
     numbers = SequenceTracker()
     assert all(numbers.add_backfilled("a", number, number * 10) for number in (4, 5))
