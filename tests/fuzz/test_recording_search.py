@@ -55,3 +55,8 @@ def test_original_behind_two_answers_is_not_written_again(tmp_path: Path) -> Non
 def test_answer_about_a_reconnect_is_none_about_the_whole_recording(tmp_path: Path) -> None:
     """In this recording, a car answers at once, but it was asked only for what came after a reconnect."""
     assert play(7372, tmp_path).violations == []
+
+
+def test_gap_behind_a_message_of_the_interrupted_session_is_asked_for(tmp_path: Path) -> None:
+    """In this recording, the answer before the gap has only what the killed recorder had recorded."""
+    assert play(11173, tmp_path).violations == []

@@ -209,17 +209,17 @@ class SessionWriter:
         gaps_before = 0 if before is None else len(before.gaps)
         if not state.tracker.add_backfilled(sender, sequence, hash(payload)):
             return False
-        if self._is_recorded(key, sequence, str(sample.encoding), payload, published_ns):
-            return False
-        self._irregular_keys.add(key)
         known = state.tracker.senders[sender]
         # A gap behind an answer that broke off begins at its last message, not when it was received. The clock of the
         # publisher may be ahead.
         known.heard_ns = known.heard_ns or min(live_ns, received_ns)
+        if len(known.gaps) > gaps_before and not was_missing:  # the answer did not go back far enough
+            self._request(key, known)
+        if self._is_recorded(key, sequence, str(sample.encoding), payload, published_ns):
+            return False
+        self._irregular_keys.add(key)
         if was_missing:
             self.recovered[key] = self.recovered.get(key, 0) + 1
-        elif len(known.gaps) > gaps_before:  # the answer did not go back far enough
-            self._request(key, known)
         if before is None:
             self._note_newcomer(key, sender, sequence, live_ns)
         self._write((state, received_ns, payload, published_ns, sequence))
