@@ -67,7 +67,7 @@ class FleetMetrics:
         """Yield all values.
 
         `sees_gateways` is False while the link to the hub is lost, and while tokens may be missing after it is back. A
-        gateway that is not seen then may be there, so nothing is said of its car.
+        gateway that is not seen then may be there, so its car has no metrics.
         """
         cars = sorted(self.observer.snapshot(()).cars)[:MAX_EXPORTED_CARS]
         for name in cars:

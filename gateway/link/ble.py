@@ -113,8 +113,7 @@ class BleLink(BufferedLink):
 
     async def _search(self) -> _Devices:
         """Return the device as each adapter knows it. Empty if an existing connection was taken over."""
-        await bluez.give_bleak_missed_objects()
-        connections = await bluez.list_connections()
+        connections = await bluez.start_bleak()
         adapters = self._allowed(list(connections))
         # A killed gateway leaves its module connected, and a scan does not find connected modules. So look at the
         # connected ones, on all adapters: the module may be connected to an adapter that is no longer allowed.

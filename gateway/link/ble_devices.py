@@ -50,9 +50,8 @@ class BleDevice(Device):
 
 async def _discover(seconds: float) -> dict[str, tuple[BLEDevice, AdvertisementData]]:
     """Return the devices that advertise within this time to any adapter, by address. Raises whatever bleak raises."""
-    await bluez.give_bleak_missed_objects()
     # If there are several adapters, bleak would use any one of them, but a car may be in range of only one.
-    options: list[BlueZScannerArgs] = [{"adapter": name} for name in await bluez.list_connections()]
+    options: list[BlueZScannerArgs] = [{"adapter": name} for name in await bluez.start_bleak()]
     scans = [BleakScanner.discover(timeout=seconds, return_adv=True, bluez=each) for each in options or [{}]]
     return {address: each for scan in await asyncio.gather(*scans) for address, each in scan.items()}
 

@@ -320,7 +320,7 @@ class FakeBluez:
             return
         for caller in list(self._callers):
             if caller.wants(path, interface, member, body):
-                await caller.send(_signal(path, interface, member, signature, body))
+                await caller.send(_new_signal(path, interface, member, signature, body))
 
     # ------------------------------------------------------------------ BlueZ
 
@@ -446,7 +446,7 @@ class FakeBluez:
             for adapter in self.adapters:
                 module.known.add(adapter.name)
                 body = [module.path_at(adapter.name), self._device(module, adapter)]
-                yield _signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", body)
+                yield _new_signal("/", OBJECTS, "InterfacesAdded", "oa{sa{sv}}", body)
 
     async def _hung_up(self, module: Module) -> None:
         path, gone = module.path, list(self._gatt(module))
@@ -571,7 +571,7 @@ async def _received(reader: asyncio.StreamReader) -> Message:
     return message
 
 
-def _signal(path: str, interface: str, member: str, signature: str, body: list[Any]) -> Message:
+def _new_signal(path: str, interface: str, member: str, signature: str, body: list[Any]) -> Message:
     return Message(
         message_type=MessageType.SIGNAL, path=path, interface=interface, member=member, signature=signature, body=body
     )
